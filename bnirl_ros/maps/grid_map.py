@@ -1,0 +1,57 @@
+"""A planning map: free cells, and where they lie in the map frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+
+@dataclass(frozen=True, eq=False)
+class GridMap:
+    """Free space on a grid, as nav_msgs/OccupancyGrid places it.
+
+    Attributes:
+        free: (height, width) bool, indexed [y, x]; (0, 0) is the lower left cell.
+        resolution: edge of a cell [m].
+        origin: (x, y, yaw) of the lower left corner of cell (0, 0) in the frame [m, m, rad].
+        frame_id: the frame in which positions are given.
+    """
+
+    free: npt.NDArray[np.bool_]
+    resolution: float = 1.0
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    frame_id: str = "map"
+
+    def cells_of(self, positions: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """Cells (N, 2) in which the positions (N, 2) [m] lie; they may lie outside the map."""
+        x, y, yaw = self.origin
+        offset = np.asarray(positions, dtype=np.float64).reshape(-1, 2) - (x, y)
+        cosine, sine = np.cos(yaw), np.sin(yaw)
+        along = offset @ np.array([[cosine, -sine], [sine, cosine]])
+        # Far positions would overflow int64 (undefined in C); a cell this far is outside any map.
+        cells = np.clip(np.floor(along / self.resolution), -(2**62), 2**62)
+        return np.asarray(cells, dtype=np.int64)
+
+    def centres_of(self, cells: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """Centres (N, 2) of the cells (N, 2) in the frame [m]."""
+        x, y, yaw = self.origin
+        along = (np.asarray(cells, dtype=np.float64).reshape(-1, 2) + 0.5) * self.resolution
+        cosine, sine = np.cos(yaw), np.sin(yaw)
+        centres = along @ np.array([[cosine, sine], [-sine, cosine]]) + (x, y)
+        return np.asarray(centres, dtype=np.float64)
+
+    def contains(self, cells: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Which of the cells (N, 2) lie on the map."""
+        cells = np.asarray(cells, dtype=np.int64).reshape(-1, 2)
+        height, width = self.free.shape
+        inside = (cells >= 0) & (cells < (width, height))
+        return np.asarray(inside.all(axis=1))
+
+    def is_free(self, cells: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Which of the cells (N, 2) lie on the map and are free."""
+        cells = np.asarray(cells, dtype=np.int64).reshape(-1, 2)
+        free = self.contains(cells)
+        free[free] = self.free[cells[free, 1], cells[free, 0]]
+        return free
