@@ -7,6 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from bnirl_ros.demonstrations.demonstration import Demonstration
+from bnirl_ros.inference.posterior import Posterior
+from bnirl_ros.maps.grid_map import GridMap
+
 
 @dataclass(frozen=True)
 class Subgoal:
@@ -54,3 +58,97 @@ class Summary:
     ess: float | None
     chains: int
     draws: int
+
+
+def summarise(posterior: Posterior, grid_map: GridMap) -> Summary:
+    """What a posterior says: the subgoals of its mode, ranked, placed and in order of visit."""
+    demonstration, mode = posterior.demonstration, posterior.mode
+    probability = posterior.subgoal_probability()
+    candidates, index, counts = np.unique(mode.subgoal_of, return_inverse=True, return_counts=True)
+    by_rank = np.argsort(-counts, kind="stable")  # equal counts: by row and column of the cell
+    rank_of = (np.argsort(by_rank) + 1)[index]
+    cells = posterior.candidates[candidates[by_rank]]
+    visits = episode_visits(demonstration, cells, rank_of)
+    height_width = grid_map.free.shape
+    cell_probability = np.zeros(height_width)
+    cell_probability[posterior.candidates[:, 1], posterior.candidates[:, 0]] = probability
+    subgoals = tuple(
+        Subgoal(
+            rank=rank,
+            cell=(int(cell[0]), int(cell[1])),
+            position=(float(position[0]), float(position[1])),
+            probability=float(probability[candidates[by_rank[rank - 1]]]),
+            observations=int(counts[by_rank[rank - 1]]),
+            visit_order=next(
+                (
+                    tuple(place + 1 for place, visit in enumerate(episode) if visit == rank)
+                    for episode in visits
+                    if rank in episode
+                ),
+                (),
+            ),
+        )
+        for rank, (cell, position) in enumerate(
+            zip(cells, grid_map.centres_of(cells), strict=True), start=1
+        )
+    )
+    return Summary(
+        subgoals=subgoals,
+        visit_sequence=tuple(dict.fromkeys(visit for episode in visits for visit in episode)),
+        observations=demonstration.observations,
+        rank_of=rank_of,
+        cell_probability=cell_probability,
+        rhat=posterior.rhat,
+        ess=posterior.ess,
+        chains=len(posterior.draws),
+        draws=posterior.draws.log_joint.shape[1],
+    )
+
+
+def episode_visits(
+    demonstration: Demonstration,
+    cells: npt.NDArray[np.int64],
+    rank_of: npt.NDArray[np.int64],
+) -> list[list[int]]:
+    """Ranks of the subgoals that each episode visits, in order, without repetitions in a row.
+
+    The paper's model knows no order, so it is read off the path: a subgoal is visited where the
+    demonstrator is in its cell, having pursued it (some observation was assigned to it) since the
+    last visit. One that is pursued in an episode but never reached counts where its last
+    observation was made.
+
+    Args:
+        demonstration: N observations, and last poses.
+        cells: (J, 2) cells of the subgoals, rank 1 first.
+        rank_of: (N,) rank of the subgoal to which each observation is assigned.
+    """
+    rank_of_cell = {(int(x), int(y)): rank for rank, (x, y) in enumerate(cells, start=1)}
+    last_cell = {
+        int(episode): (int(x), int(y))
+        for episode, (x, y) in zip(
+            demonstration.last_episode, demonstration.last_cells, strict=True
+        )
+    }
+    visits = []
+    for episode in np.unique(demonstration.episode):
+        chosen = np.flatnonzero(demonstration.episode == episode)
+        path = [(int(x), int(y)) for x, y in demonstration.cells[chosen]]
+        pursued = [int(rank) for rank in rank_of[chosen]]
+        pursued_at = dict(zip(pursued, range(len(pursued)), strict=True))  # the last time
+        if int(episode) in last_cell:
+            path.append(last_cell[int(episode)])
+        under_way: set[int] = set()
+        arrivals = []
+        for time, cell in enumerate(path):
+            under_way.update(pursued[time : time + 1])
+            rank = rank_of_cell.get(cell)
+            if rank in under_way:
+                under_way.remove(rank)
+                arrivals.append((time, rank))
+        reached = {rank for _, rank in arrivals}
+        missed = [(time, rank) for rank, time in pursued_at.items() if rank not in reached]
+        in_order = [rank for _, rank in sorted(arrivals + missed)]
+        visits.append(
+            [r for r, before in zip(in_order, [0, *in_order], strict=False) if r != before]
+        )
+    return visits

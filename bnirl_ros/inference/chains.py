@@ -1,0 +1,71 @@
+"""Several chains side by side, reproducible bit for bit whatever the number of cores."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from threading import Event
+
+import numpy as np
+
+from bnirl_ros.inference import partition_gibbs as sampler
+from bnirl_ros.inference.draws import Draws
+from bnirl_ros.inference.settings import Settings
+from bnirl_ros.model.mixture import SubgoalMixture
+
+_SWEEPS_AT_ONCE = 50  # between two looks at whether to stop
+
+Progress = Callable[[int], None]
+"""Called, from any thread, with the number of sweeps done since the last call."""
+
+
+class StoppedError(Exception):
+    """The inference was asked to stop before its end."""
+
+
+def run_chains(
+    mixture: SubgoalMixture,
+    settings: Settings,
+    progress: Progress | None = None,
+    stop: Event | None = None,
+) -> Draws:
+    """Draws (chain, draw, N) of fresh chains, each with a generator of its own from the seed.
+
+    Raises:
+        StoppedError: `stop` was set meanwhile.
+    """
+    stop = stop or Event()
+    observations = len(mixture.pair_of)
+    draws = Draws.empty((settings.chains, settings.draws), observations)
+
+    def run_chain(chain: int, seed: np.random.SeedSequence) -> None:
+        generator = np.random.default_rng(seed)
+        state = sampler.initial_state(mixture, generator)
+        burnt = Draws.empty((1,), observations)  # where a chain is after part of the burn-in
+        parts = [(burnt, sweeps) for sweeps in _parts(settings.burn_in, _SWEEPS_AT_ONCE)]
+        draws_at_once = max(1, _SWEEPS_AT_ONCE // settings.thin)
+        start = 0
+        for count in _parts(settings.draws, draws_at_once):
+            parts.append((draws[chain][start : start + count], settings.thin))
+            start += count
+        for part, thin in parts:
+            if stop.is_set():
+                raise StoppedError
+            sampler.advance(mixture, state, generator, part, thin)
+            if progress:
+                progress(len(part) * thin)
+
+    seeds = np.random.SeedSequence(settings.seed).spawn(settings.chains)
+    with ThreadPoolExecutor(min(settings.chains, os.cpu_count() or 1)) as threads:
+        try:
+            list(threads.map(run_chain, range(settings.chains), seeds))
+        except BaseException:
+            stop.set()  # Ctrl-C should not wait for the chains' end
+            raise
+    return draws
+
+
+def _parts(whole: int, size: int) -> list[int]:
+    """`whole` in parts of `size`, the last one smaller."""
+    return [min(size, whole - start) for start in range(0, whole, size)]

@@ -1,0 +1,93 @@
+"""Have the chains converged? Split R-hat and effective sample size (Vehtari et al. 2021)."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+
+def rhat(values: npt.ArrayLike) -> float | None:
+    """Rank-normalised split R-hat: the larger one of bulk and tail; 1 when chains agree.
+
+    Vehtari, Gelman, Simpson, Carpenter, Bürkner, Bayesian Analysis 16(2), 2021, sections 3-4.
+
+    Args:
+        values: (chain, draw) of one scalar.
+
+    Returns:
+        None where it says nothing: one chain, fewer than four draws, or no variance at all.
+    """
+    chains = np.asarray(values, dtype=np.float64)
+    if chains.shape[0] < 2 or chains.shape[1] < 4 or np.ptp(chains) == 0.0:
+        return None
+    halves = _split(chains)
+    bulk = _plain_rhat(_rank_normalised(halves))
+    tail = _plain_rhat(_rank_normalised(np.abs(halves - np.median(halves))))
+    return max(bulk, tail)
+
+
+def effective_sample_size(values: npt.ArrayLike) -> float | None:
+    """Bulk effective sample size of the draws of all chains together.
+
+    The same source, section 4; autocorrelations by Geyer's initial monotone sequence.
+
+    Args:
+        values: (chain, draw) of one scalar.
+
+    Returns:
+        None for fewer than four draws, or no variance.
+    """
+    chains = np.asarray(values, dtype=np.float64)
+    if chains.shape[1] < 4 or np.ptp(chains) == 0.0:
+        return None
+    split = _rank_normalised(_split(chains))
+    count, length = split.shape
+    covariance = _autocovariance(split)
+    within = covariance[:, 0].mean() * length / (length - 1.0)
+    pooled = within * (length - 1.0) / length
+    if count > 1:
+        pooled += split.mean(axis=1).var(ddof=1)
+    correlation = 1.0 - (within - covariance.mean(axis=0)) / pooled
+    correlation[0] = 1.0
+    pairs = correlation[: length // 2 * 2].reshape(-1, 2).sum(axis=1)
+    negative = np.flatnonzero(pairs < 0.0)
+    kept = int(negative[0]) if negative.size else len(pairs)
+    time = -1.0 + 2.0 * np.minimum.accumulate(pairs[:kept]).sum()
+    if kept < len(pairs):  # half of the first pair left out, where that is positive
+        time += max(correlation[2 * kept], 0.0)
+    draws = count * length
+    return float(draws / max(time, 1.0 / np.log10(draws)))
+
+
+def _split(chains: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Each chain's halves as chains of their own; a middle draw is left out."""
+    half = chains.shape[1] // 2
+    return np.concatenate([chains[:, :half], chains[:, -half:]])
+
+
+def _rank_normalised(chains: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Normal scores of the average ranks over all chains (Blom's offsets)."""
+    from scipy.special import ndtri  # here: only diagnostics need it, and start-up time counts
+
+    _, index, counts = np.unique(chains, return_inverse=True, return_counts=True)
+    rank = (np.cumsum(counts) - (counts - 1) / 2.0)[index.reshape(-1)]
+    scores = ndtri((rank - 0.375) / (chains.size + 0.25))
+    return np.asarray(scores.reshape(chains.shape))
+
+
+def _plain_rhat(chains: npt.NDArray[np.float64]) -> float:
+    length = chains.shape[1]
+    within = chains.var(axis=1, ddof=1).mean()
+    between = length * chains.mean(axis=1).var(ddof=1)
+    if within == 0.0:  # every half-chain stands still: they agree, or never will
+        return 1.0 if between == 0.0 else float("inf")
+    return float(np.sqrt((between / within + length - 1.0) / length))
+
+
+def _autocovariance(chains: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """(chain, lag) biased autocovariances, by the Fourier transform."""
+    length = chains.shape[1]
+    centred = chains - chains.mean(axis=1, keepdims=True)
+    spectrum = np.fft.rfft(centred, n=2 * length, axis=1)
+    covariance = np.fft.irfft(spectrum * spectrum.conj(), n=2 * length, axis=1)[:, :length]
+    return np.asarray(covariance / length)

@@ -1,0 +1,45 @@
+"""Posterior draws, as every sampler records them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """What a chain leaves behind; with a further leading axis, what several chains do.
+
+    Attributes:
+        subgoal_of: (draw, N) int32 candidate index of each observation's subgoal.
+        partition_of: (draw, N) int32 partition of each observation, numbered from 0 in the order
+            of their first observations: two draws with the same partition are equal arrays.
+        log_joint: (draw,) float64 log of (10).
+    """
+
+    subgoal_of: npt.NDArray[np.int32]
+    partition_of: npt.NDArray[np.int32]
+    log_joint: npt.NDArray[np.float64]
+
+    @classmethod
+    def empty(cls, shape: tuple[int, ...], observations: int) -> Draws:
+        """Room for draws: `shape` is (draws,) or (chains, draws)."""
+        return cls(
+            subgoal_of=np.empty((*shape, observations), dtype=np.int32),
+            partition_of=np.empty((*shape, observations), dtype=np.int32),
+            log_joint=np.empty(shape, dtype=np.float64),
+        )
+
+    def __getitem__(self, key: int | slice) -> Draws:
+        """A part along the leading axis, as a view."""
+        return Draws(self.subgoal_of[key], self.partition_of[key], self.log_joint[key])
+
+    def __len__(self) -> int:
+        return len(self.log_joint)
+
+    @property
+    def partition_count(self) -> npt.NDArray[np.int64]:
+        """(...,) number of partitions in each draw."""
+        return np.asarray(self.partition_of.max(axis=-1, initial=-1) + 1, dtype=np.int64)

@@ -1,0 +1,118 @@
+"""Every setting of an inference, declared once: for Python, the command line and the node."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import Field, dataclass, field, fields
+from typing import Any
+
+from bnirl_ros.errors import InputError
+from bnirl_ros.model.candidates import CANDIDATE_KINDS
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a setting may be.
+
+    Attributes:
+        description: for `--help` and `ros2 param describe`, with the symbol and the unit.
+        lowest, highest: bounds, in the range themselves unless `above` or `below` says not.
+        above, below: exclusive bounds.
+        choices: the values that there are, where they can be counted.
+    """
+
+    description: str
+    lowest: float = -math.inf
+    highest: float = math.inf
+    above: float = -math.inf
+    below: float = math.inf
+    choices: tuple[Any, ...] = ()
+
+    def fault(self, name: str, value: Any) -> str | None:
+        """One sentence on what is wrong with a value, or None."""
+        if self.choices:
+            if value in self.choices:
+                return None
+            return f"{name} must be one of {', '.join(map(str, self.choices))}, not {value}"
+        if isinstance(value, float) and not math.isfinite(value):
+            return f"{name} must be a finite number, not {value}"
+        if not max(self.lowest, self.above) <= value <= min(self.highest, self.below) or (
+            value in (self.above, self.below)
+        ):
+            return f"{name} must be {self.range_in_words()}, not {value}"
+        return None
+
+    def range_in_words(self) -> str:
+        """Such as "above 0 and at most 1"; empty where everything goes."""
+        bounds = (
+            (self.above, "above {:g}"),
+            (self.lowest, "at least {:g}"),
+            (self.below, "below {:g}"),
+            (self.highest, "at most {:g}"),
+        )
+        return " and ".join(words.format(bound) for bound, words in bounds if abs(bound) < 1e300)
+
+
+def _setting(default: Any, description: str, **limits: Any) -> Any:
+    return field(default=default, metadata={"limits": Limits(description, **limits)})
+
+
+def limits_of(setting: Field[Any]) -> Limits:
+    """The limits that a field of `Settings` was declared with."""
+    limits: Limits = setting.metadata["limits"]
+    return limits
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Model and sampling settings; the defaults are those of `bnirl infer` and the node.
+
+    Raises:
+        InputError: a value is out of its range; the sentence names it.
+    """
+
+    model: str = _setting(
+        "paper", "model of the demonstrator: the mixture of Michini & How", choices=("paper",)
+    )
+    alpha: float = _setting(
+        50.0, "confidence alpha in the demonstrator's choices, equation (7)", above=0.0
+    )
+    eta: float = _setting(
+        1.0, "concentration eta of the Chinese restaurant process, equation (5)", above=0.0
+    )
+    sweeps: int = _setting(1000, "sweeps of each chain, burn-in included", lowest=1)
+    burn_in: int = _setting(200, "first sweeps of each chain that are left out", lowest=0)
+    thin: int = _setting(1, "every how many sweeps a draw is kept", lowest=1)
+    chains: int = _setting(4, "number of independent chains", lowest=1, highest=1000)
+    seed: int = _setting(0, "seed of the random numbers", lowest=0)
+    success: float = _setting(
+        0.7,
+        "probability that a move goes as chosen; the rest is spread over the other actions",
+        above=0.0,
+        highest=1.0,
+    )
+    discount: float = _setting(0.99, "discount factor gamma", lowest=0.0, below=1.0)
+    moves: int = _setting(
+        8, "moves to neighbouring cells: 8, or 4 for no diagonals", choices=(4, 8)
+    )
+    candidates: str = _setting(
+        "visited",
+        "cells that may be subgoals: the visited ones, or all free ones",
+        choices=CANDIDATE_KINDS,
+    )
+
+    def __post_init__(self) -> None:
+        for setting in fields(self):
+            fault = limits_of(setting).fault(setting.name, getattr(self, setting.name))
+            if fault:
+                raise InputError(fault)
+        if self.draws < 1:
+            raise InputError(
+                f"sweeps must leave a draw: {self.sweeps} sweeps less {self.burn_in} of burn-in "
+                f"hold none at thin {self.thin}"
+            )
+
+    @property
+    def draws(self) -> int:
+        """Draws kept from each chain."""
+        return (self.sweeps - self.burn_in) // self.thin

@@ -1,0 +1,204 @@
+"""A grid world: the special case of a finite MDP that a map gives, with fast goal values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from bnirl_ros.mdp.actions import ACTION_SETS, STEPS
+
+
+@dataclass(frozen=True, eq=False)
+class GridWorld:
+    """A robot that moves over the free cells of a grid, now and then another way than it meant.
+
+    A state is a cell, numbered `y * width + x`; blocked cells are states that never occur. Each
+    action names a neighbouring cell (or the cell itself). A move that is blocked stays; a diagonal
+    move is blocked also where either of the two cells beside it is. With probability `success` the
+    outcome is the one of the chosen action; the remainder is spread evenly over the outcomes of
+    the other actions.
+
+    Attributes:
+        free: (height, width) bool, indexed [y, x], y up.
+        moves: 8, or 4 for no diagonals; staying is possible in both.
+        success: probability that the chosen action happens, in (0, 1].
+        discount: gamma of equation (1), in [0, 1).
+
+    Raises:
+        ValueError: a parameter is out of its range, or no cell is free.
+    """
+
+    free: npt.NDArray[np.bool_]
+    moves: int = 8
+    success: float = 0.7
+    discount: float = 0.99
+
+    def __post_init__(self) -> None:
+        if self.free.ndim != 2 or not self.free.any():
+            raise ValueError("free must be a (height, width) array with at least one free cell")
+        if self.moves not in ACTION_SETS:
+            raise ValueError(f"moves must be 4 or 8, not {self.moves}")
+        if not 0.0 < self.success <= 1.0:
+            raise ValueError(f"success must be above 0 and at most 1, not {self.success}")
+        if not 0.0 <= self.discount < 1.0:
+            raise ValueError(f"discount must be at least 0 and below 1, not {self.discount}")
+
+    @property
+    def actions(self) -> npt.NDArray[np.int64]:
+        """Indices (A,) into `ACTION_NAMES` of the actions of this world, ascending."""
+        return np.array(ACTION_SETS[self.moves], dtype=np.int64)
+
+    @property
+    def state_count(self) -> int:
+        """Number of states: all cells, the blocked ones included."""
+        return int(self.free.size)
+
+    def states_of(self, cells: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """State numbers (N,) of the cells (N, 2)."""
+        cells = np.asarray(cells, dtype=np.int64).reshape(-1, 2)
+        return cells[:, 1] * self.free.shape[1] + cells[:, 0]
+
+    def cells_of(self, states: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """Cells (N, 2) of the state numbers (N,)."""
+        y, x = np.divmod(np.asarray(states, dtype=np.int64).reshape(-1), self.free.shape[1])
+        return np.stack([x, y], axis=1)
+
+    @cached_property
+    def open_moves(self) -> npt.NDArray[np.uint16]:
+        """(height, width) bit sets: bit k tells that action k of `actions` is not blocked."""
+        height, width = self.free.shape
+        around = np.pad(self.free, 1)
+
+        def free_at(dx: int, dy: int) -> npt.NDArray[np.bool_]:
+            return around[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
+
+        bits = np.zeros(self.free.shape, dtype=np.uint16)
+        for position, (dx, dy) in enumerate(STEPS[self.actions].tolist()):
+            passable = self.free & free_at(dx, dy) & free_at(dx, 0) & free_at(0, dy)
+            bits |= passable.astype(np.uint16) << np.uint16(position)
+        return bits
+
+    @cached_property
+    def offsets(self) -> npt.NDArray[np.int64]:
+        """(A,) what each action adds to the state number where it is not blocked."""
+        steps = STEPS[self.actions]
+        return steps[:, 1] * self.free.shape[1] + steps[:, 0]
+
+    def outcomes(self) -> npt.NDArray[np.int64]:
+        """(S, A) state to which each action leads from each state when it succeeds."""
+        states = np.arange(self.state_count)[:, None]
+        is_open = (self.open_moves.reshape(-1, 1) >> np.arange(len(self.offsets))) & 1
+        return np.where(is_open, states + self.offsets, states)
+
+    def transitions(self) -> list[Any]:
+        """Transition probabilities, an array (S, S) in compressed sparse rows for each action."""
+        from scipy.sparse import csr_array  # here, since only this conversion needs it
+
+        outcomes = self.outcomes()
+        state_count, action_count = outcomes.shape
+        rows = np.repeat(np.arange(state_count), action_count)
+        spread = (1.0 - self.success) / (action_count - 1)
+        layers = []
+        for action in range(action_count):
+            weights = np.full((state_count, action_count), spread)
+            weights[:, action] = self.success
+            entries = (weights.reshape(-1), (rows, outcomes.reshape(-1)))
+            layers.append(csr_array(entries, shape=(state_count, state_count)))
+        return layers
+
+    def goal_values_of(
+        self,
+        goals: npt.NDArray[np.int64],
+        states: npt.NDArray[np.int64],
+        tolerance: float,
+    ) -> npt.NDArray[np.float64]:
+        """Q*(s, a, R_g) of a few goals at once; see `bnirl_ros.mdp.goal_values.goal_values`."""
+        spread = (1.0 - self.success) / (len(self.offsets) - 1)
+        motion = (self.open_moves, self.offsets, self.success, spread, self.discount)
+        first_passage = _first_passage(*motion, goals, tolerance)
+        return _action_values(*motion, goals, states, first_passage)
+
+
+@njit(nogil=True, cache=True)
+def _first_passage(open_moves, offsets, success, spread, discount, goals, tolerance):  # type: ignore[no-untyped-def]
+    """Discounted first-passage values h (S, G): h_g(g) = 1, elsewhere gamma max_a E[h_g(s')].
+
+    Gauss-Seidel value iteration from below, all goals in the lanes of the innermost loop, the
+    cells in four alternating orders so that the wave from a goal is carried along whichever way
+    it runs. A sweep is a contraction by gamma, so a largest change d leaves an error of at most
+    d gamma / (1 - gamma). Ends when that is within `tolerance`, or where float64 resolves no more.
+
+    The mean over the outcomes n_b of action a is (success - spread) n_a + spread sum_b n_b.
+    """
+    height, width = open_moves.shape
+    lanes = goals.shape[0]
+    advantage = success - spread
+    values = np.zeros((height * width, lanes))
+    for lane in range(lanes):
+        values[goals[lane], lane] = 1.0
+    total = np.empty(lanes)
+    best = np.empty(lanes)
+    sweep = 0
+    largest_change = np.inf
+    while largest_change * discount > max(tolerance * (1.0 - discount), 4e-16):
+        largest_change = 0.0
+        for row in range(height):
+            y = row if sweep & 2 == 0 else height - 1 - row
+            for column in range(width):
+                x = column if sweep & 1 == 0 else width - 1 - column
+                bits = open_moves[y, x]
+                if bits == 0:  # a blocked cell; in a free one, staying is always open
+                    continue
+                state = y * width + x
+                total[:] = 0.0
+                best[:] = -np.inf
+                for action in range(offsets.shape[0]):
+                    outcome = state + offsets[action] if (bits >> action) & 1 else state
+                    for lane in range(lanes):
+                        value = values[outcome, lane]
+                        total[lane] += value
+                        best[lane] = max(best[lane], advantage * value)
+                for lane in range(lanes):
+                    if state != goals[lane]:
+                        value = discount * (best[lane] + spread * total[lane])
+                        largest_change = max(largest_change, abs(value - values[state, lane]))
+                        values[state, lane] = value
+        sweep += 1
+    return values
+
+
+@njit(nogil=True, cache=True)
+def _expected(values, lane, state, bits, offsets, success, spread, expected):  # type: ignore[no-untyped-def]
+    """Fill expected (A,) with the mean of values[:, lane] after each action in `state`."""
+    total = 0.0
+    for action in range(offsets.shape[0]):
+        outcome = state + offsets[action] if (bits >> action) & 1 else state
+        expected[action] = values[outcome, lane]
+        total += values[outcome, lane]
+    for action in range(offsets.shape[0]):
+        expected[action] = (success - spread) * expected[action] + spread * total
+
+
+@njit(nogil=True, cache=True)
+def _action_values(open_moves, offsets, success, spread, discount, goals, states, first_passage):  # type: ignore[no-untyped-def]
+    """Q* (U, A, G) at `states`: V_g = h_g V_g(g), V_g(g) = 1 + gamma V_g(g) max_a E[h_g]."""
+    bits = open_moves.reshape(-1)
+    action_count = offsets.shape[0]
+    values = np.empty((states.shape[0], action_count, goals.shape[0]))
+    expected = np.empty(action_count)
+    for lane in range(goals.shape[0]):
+        goal = goals[lane]
+        _expected(first_passage, lane, goal, bits[goal], offsets, success, spread, expected)
+        goal_value = 1.0 / (1.0 - discount * expected.max())
+        for index in range(states.shape[0]):
+            state = states[index]
+            _expected(first_passage, lane, state, bits[state], offsets, success, spread, expected)
+            reward = 1.0 if state == goal else 0.0
+            for action in range(action_count):
+                values[index, action, lane] = reward + discount * goal_value * expected[action]
+    return values

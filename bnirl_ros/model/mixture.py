@@ -1,0 +1,102 @@
+"""The paper's model: a Chinese restaurant process mixture of subgoals over the observations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from bnirl_ros.demonstrations.demonstration import Demonstration
+from bnirl_ros.mdp.goal_values import goal_values
+from bnirl_ros.mdp.grid_world import GridWorld
+from bnirl_ros.model.likelihood import action_log_likelihood
+
+
+@dataclass(frozen=True, eq=False)
+class SubgoalMixture:
+    """A CRP mixture over N observations whose partitions each have one of G candidate subgoals.
+
+    Observations with the same state and action are equally likely under every subgoal, so the
+    likelihood is kept once for each of the K distinct pairs.
+
+    Attributes:
+        log_likelihood: (K, G) float64 log P(O | g), equation (7).
+        pair_of: (N,) int64 row of `log_likelihood` for each observation.
+        log_prior: (G,) float64 log P(g).
+        eta: concentration of the process (5), above 0.
+    """
+
+    log_likelihood: npt.NDArray[np.float64]
+    pair_of: npt.NDArray[np.int64]
+    log_prior: npt.NDArray[np.float64]
+    eta: float
+
+    @cached_property
+    def scaled_likelihood(self) -> npt.NDArray[np.float64]:
+        """(K, G) likelihood over its largest value in the row: in [0, 1], 1 occurs in each row.
+
+        All comparisons between subgoals for one observation are the same on this scale, and the
+        weight of a new partition cannot underflow on it.
+        """
+        return np.exp(self.log_likelihood - self.log_likelihood.max(axis=1, keepdims=True))
+
+    @cached_property
+    def new_partition_weight(self) -> npt.NDArray[np.float64]:
+        """(K,) eta sum_g P(g) P(O | g), scaled as above: exact, as P(g) is discrete."""
+        return self.eta * (self.scaled_likelihood @ np.exp(self.log_prior))
+
+    def log_joint(self, partition_of: npt.ArrayLike, subgoal_of_partition: npt.ArrayLike) -> float:
+        """Log of the joint (10) of a partition, its subgoals and the observations.
+
+        Args:
+            partition_of: (N,) partition of each observation, numbered from 0 without gaps.
+            subgoal_of_partition: (J,) candidate index of each partition's subgoal.
+        """
+        partition_of = np.asarray(partition_of, dtype=np.int64)
+        subgoals = np.asarray(subgoal_of_partition, dtype=np.int64)
+        sizes = np.bincount(partition_of, minlength=len(subgoals))
+        likelihood = self.log_likelihood[self.pair_of, subgoals[partition_of]].sum()
+        return float(likelihood + log_crp(sizes, self.eta) + self.log_prior[subgoals].sum())
+
+
+def log_crp(sizes: npt.ArrayLike, eta: float) -> float:
+    """Log probability of a set partition with these block sizes: the product of (5) in any order.
+
+    eta^J prod_j (n_j - 1)! / prod_{i=1..N} (i - 1 + eta).
+    """
+    sizes = np.asarray(sizes, dtype=np.int64)
+    factorials = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, max(sizes.sum(), 1) + 1)))])
+    seats = np.log(np.arange(sizes.sum()) + eta).sum()
+    return float(len(sizes) * np.log(eta) + factorials[sizes - 1].sum() - seats)
+
+
+def subgoal_mixture(
+    demonstration: Demonstration,
+    world: GridWorld,
+    candidates: npt.NDArray[np.int64],
+    alpha: float,
+    eta: float,
+) -> SubgoalMixture:
+    """The paper's model of a demonstration: likelihood (7), P(g) uniform over the candidates.
+
+    Args:
+        demonstration: N observations on free cells, their actions among those of `world`.
+        world: the grid world in which they were made.
+        candidates: (G, 2) free cells in the support of P(g).
+        alpha: confidence; above 0.
+        eta: concentration; above 0.
+    """
+    states = world.states_of(demonstration.cells)
+    visited, state_index = np.unique(states, return_inverse=True)
+    position = np.searchsorted(world.actions, demonstration.action)
+    pairs, pair_of = np.unique(state_index * len(world.actions) + position, return_inverse=True)
+    values = goal_values(world, world.states_of(candidates), visited)
+    by_pair = action_log_likelihood(values, alpha).reshape(-1, len(candidates))
+    return SubgoalMixture(
+        log_likelihood=np.ascontiguousarray(by_pair[pairs]),
+        pair_of=pair_of.astype(np.int64),
+        log_prior=np.full(len(candidates), -np.log(len(candidates))),
+        eta=eta,
+    )
