@@ -15,10 +15,10 @@ def rhat(values: npt.ArrayLike) -> float | None:
         values: (chain, draw) of one scalar.
 
     Returns:
-        None where it says nothing: one chain, fewer than four draws, or no variance at all.
+        None where it says nothing: one chain, fewer than eight draws, or no variance at all.
     """
     chains = np.asarray(values, dtype=np.float64)
-    if chains.shape[0] < 2 or chains.shape[1] < 4 or np.ptp(chains) == 0.0:
+    if chains.shape[0] < 2 or chains.shape[1] < 8 or np.ptp(chains) == 0.0:
         return None
     halves = _split(chains)
     bulk = _plain_rhat(_rank_normalised(halves))
@@ -35,10 +35,10 @@ def effective_sample_size(values: npt.ArrayLike) -> float | None:
         values: (chain, draw) of one scalar.
 
     Returns:
-        None for fewer than four draws, or no variance.
+        None for fewer than eight draws, or no variance.
     """
     chains = np.asarray(values, dtype=np.float64)
-    if chains.shape[1] < 4 or np.ptp(chains) == 0.0:
+    if chains.shape[1] < 8 or np.ptp(chains) == 0.0:
         return None
     split = _rank_normalised(_split(chains))
     count, length = split.shape
@@ -51,10 +51,9 @@ def effective_sample_size(values: npt.ArrayLike) -> float | None:
     correlation[0] = 1.0
     pairs = correlation[: length // 2 * 2].reshape(-1, 2).sum(axis=1)
     negative = np.flatnonzero(pairs < 0.0)
-    kept = int(negative[0]) if negative.size else len(pairs)
-    time = -1.0 + 2.0 * np.minimum.accumulate(pairs[:kept]).sum()
-    if kept < len(pairs):  # half of the first pair left out, where that is positive
-        time += max(correlation[2 * kept], 0.0)
+    # As Stan and ArviZ: to the first negative pair, or short of the end, where lags are too noisy.
+    kept = min(int(negative[0]) if negative.size else length, (length - 3) // 2)
+    time = -1.0 + 2.0 * np.minimum.accumulate(pairs[:kept]).sum() + max(correlation[2 * kept], 0.0)
     draws = count * length
     return float(draws / max(time, 1.0 / np.log10(draws)))
 

@@ -1,0 +1,133 @@
+"""Putting a recording on a map: pose and action paired, episodes told apart, misfits counted."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from bnirl_ros.demonstrations.demonstration import Demonstration
+from bnirl_ros.demonstrations.recording import Recording
+from bnirl_ros.maps.grid_map import GridMap
+from bnirl_ros.mdp.actions import ACTION_SETS
+
+EPISODE_GAP = 2.0
+"""Default time between two poses [s] beyond which a new episode begins."""
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """A demonstration on a map, and what of the recording did not fit, counted by fault."""
+
+    demonstration: Demonstration
+    faults: Counter[str]
+
+
+def place(
+    recording: Recording, grid_map: GridMap, moves: int = 8, episode_gap: float = EPISODE_GAP
+) -> Placement:
+    """The demonstration that a recording is on a map.
+
+    Live and offline alike, and the same however the two topics were interleaved. Episodes without
+    any observation are left out; the others are numbered from 0 in the order of their poses.
+
+    Args:
+        recording: poses and actions.
+        grid_map: the map; poses in another frame than its own don't count.
+        moves: 4 or 8; actions outside that set don't count.
+        episode_gap: longest time between two poses of an episode [s].
+    """
+    faults: Counter[str] = Counter()
+
+    def count(fault: str, where: npt.NDArray[np.bool_]) -> None:
+        if where.any():
+            faults[fault] += int(np.count_nonzero(where))
+
+    same_frame = np.array([frame == grid_map.frame_id for frame in recording.frames], dtype=bool)
+    in_frame = (
+        same_frame[recording.pose_frames] if recording.frames else np.zeros(0, dtype=np.bool_)
+    )
+    count("pose in another frame than the map", ~in_frame)
+    stamps = recording.pose_stamps[in_frame]
+    cells = grid_map.cells_of(recording.positions[in_frame])
+    episode = np.cumsum(episode_starts(stamps, cells, episode_gap))
+    last_of_episode = np.append(np.diff(episode) > 0, np.ones(min(len(episode), 1), dtype=bool))
+
+    poses, paired_actions = pair_by_stamp(stamps, recording.action_stamps)
+    action = np.full(len(stamps), -1, dtype=np.int64)
+    action[poses] = recording.actions[paired_actions]
+    paired = action >= 0
+    without_pose = np.ones(len(recording.actions), dtype=bool)
+    without_pose[paired_actions] = False
+    count("action without a pose of its stamp", without_pose)
+
+    on_map = grid_map.contains(cells)
+    free = grid_map.is_free(cells)
+    possible = np.isin(action, ACTION_SETS[moves])
+    observed = paired & free & possible
+    has_observation = np.isin(episode, episode[observed])
+    last_pose = last_of_episode & ~paired & has_observation
+    count("pose outside the map", ~on_map)
+    count("pose in a blocked cell", on_map & ~free)
+    count("pose without an action of its stamp", ~paired & ~last_pose)
+    count(f"action that is none of the {moves} moves", paired & ~possible)
+
+    kept = last_pose & free
+    numbers = np.unique(episode[observed])
+    demonstration = Demonstration(
+        episode=np.searchsorted(numbers, episode[observed]),
+        cells=cells[observed],
+        action=action[observed],
+        last_episode=np.searchsorted(numbers, episode[kept]),
+        last_cells=cells[kept],
+    )
+    return Placement(demonstration, faults)
+
+
+def episode_starts(
+    stamps: npt.NDArray[np.int64], cells: npt.NDArray[np.int64], episode_gap: float
+) -> npt.NDArray[np.bool_]:
+    """Which poses begin an episode: the only place where that is decided.
+
+    An episode ends where the stamps of consecutive poses are more than `episode_gap` apart or go
+    backwards, or where their cells are no neighbours.
+
+    Args:
+        stamps: (P,) stamps in the order in which the poses came [ns].
+        cells: (P, 2) cells; outside the map they count too.
+        episode_gap: [s].
+    """
+    elapsed = np.diff(stamps)
+    apart = np.abs(np.diff(cells, axis=0)).max(axis=1, initial=0) > 1
+    ends = (elapsed < 0) | (elapsed > episode_gap * 1e9) | apart
+    return np.concatenate([np.ones(min(len(stamps), 1), dtype=bool), ends])
+
+
+def pair_by_stamp(
+    stamps: npt.NDArray[np.int64], others: npt.NDArray[np.int64]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Indices into `stamps` (P,) and `others` (Q,) of the pairs with equal stamps.
+
+    Where a stamp occurs several times, as when a bag is played in a loop, the first of one pairs
+    with the first of the other, the second with the second, and so on. Each is used once at most.
+    """
+    stamp = np.concatenate([stamps, others])
+    is_other = np.arange(len(stamp)) >= len(stamps)
+    occurrence = np.concatenate([_occurrence(stamps), _occurrence(others)])
+    order = np.lexsort((is_other, occurrence, stamp))
+    before, after = order[:-1], order[1:]
+    is_pair = (stamp[before] == stamp[after]) & (occurrence[before] == occurrence[after])
+    first = np.argsort(before[is_pair])
+    return before[is_pair][first], after[is_pair][first] - len(stamps)
+
+
+def _occurrence(stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """(P,) how many equal stamps come before each."""
+    order = np.argsort(stamps, kind="stable")
+    in_order = stamps[order]
+    starts = np.searchsorted(in_order, in_order)
+    occurrence = np.empty(len(stamps), dtype=np.int64)
+    occurrence[order] = np.arange(len(stamps)) - starts
+    return occurrence
