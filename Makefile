@@ -1,0 +1,48 @@
+# `make demo` and `make test` are the two first commands; `make help` lists all.
+
+# The virtual environment, which every target makes when it is missing or out of date.
+VENV ?= .venv
+# The Python to make it with; without it, 3.12 or 3.11, whichever is found.
+PYTHON ?=
+# Further requirements for pip, such as WITH='numpy<2'.
+WITH ?=
+# Further arguments for pytest, such as PYTEST_ARGS='-k bags -x'.
+PYTEST_ARGS ?=
+
+BIN := $(VENV)/bin
+export PYTHON WITH
+
+# The environment brings its own ROS 2 and must not see the caller's. A sourced ROS installation
+# would put its packages and middleware before ours, and a Python of another such environment, one
+# that called make, would leave its libraries and the note that they are set.
+ifneq ($(AMENT_PREFIX_PATH)$(_ROS_WHEELS_BOOTSTRAP_COMPLETE),)
+unexport LD_LIBRARY_PATH
+endif
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
+unexport AMENT_PREFIX_PATH PYTHONPATH PYTHONHOME RMW_IMPLEMENTATION
+
+.PHONY: help demo test lint unit venv clean
+
+help:  ## List the targets
+	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 16
+
+demo: venv  ## Replay a human demonstration and watch its subgoals appear
+	@$(BIN)/bnirl demo
+
+test: lint unit  ## Check style and types, then run all tests
+
+lint: venv  ## Check style and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+unit: venv  ## Run the tests, without the checks of style and types
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+venv:  ## Make the virtual environment, or bring it up to date
+	@scripts/venv $(VENV)
+
+clean:  ## Remove the virtual environments, caches and build results
+	rm -rf .venv .venv-* build install log dist bnirl_ros.egg-info
+	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,89 @@
+"""Declares the package to pip and to colcon; package.xml declares it to rosdep and colcon."""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = "bnirl_ros"
+SHARED_FOLDERS = ("launch", "config", "bags", "msg_schemas")
+
+# The lower bounds of what has a rosdep key are the versions of Ubuntu 24.04, on which ROS 2 Jazzy
+# runs: a colcon build there takes those.
+REQUIREMENTS = [
+    "matplotlib>=3.6",
+    "mcap>=1.2.1",
+    "numba>=0.58",
+    "numpy>=1.26",
+    "pillow>=10.2",
+    "pyyaml>=6.0",
+    "rich>=13.7",
+    "rosbags>=0.10.8",  # Codes messages as CDR and knows their type hashes, without ROS.
+    "scipy>=1.11",
+]
+
+EXTRAS = {
+    # The real rclpy from wheels, for machines without a ROS installation. The middleware has to be
+    # named: the other two do not bring it, and rclpy does not import without one.
+    "ros": [
+        "ros-jazzy-common-interfaces>=5.3",
+        "ros-jazzy-rclpy>=7.1",
+        "ros-jazzy-rmw-fastrtps-cpp>=8.4",
+    ],
+    "test": [
+        "hypothesis>=6.98",
+        "mcap-ros2-support>=0.5",  # A second decoder, to check the bags that we write.
+        "mypy>=1.9",
+        "pytest>=7.4",
+        "pytest-timeout>=2.2",
+        "ruff>=0.5",
+        "types-PyYAML",
+    ],
+}
+
+
+def shared_files() -> list[tuple[str, list[str]]]:
+    """The files that go under share/: what ament asks for, and every file of SHARED_FOLDERS."""
+    share = Path("share", NAME)
+    by_folder = {
+        Path("share/ament_index/resource_index/packages"): [f"resource/{NAME}"],
+        share: ["package.xml"],
+    }
+    for path in sorted(path for name in SHARED_FOLDERS for path in Path(name).rglob("*")):
+        if path.is_file() and "__pycache__" not in path.parts:
+            by_folder.setdefault(share / path.parent, []).append(str(path))
+    return [(str(folder), files) for folder, files in by_folder.items()]
+
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="Bayesian nonparametric inverse reinforcement learning for ROS 2",
+    long_description=Path("README.md").read_text(encoding="utf-8"),
+    long_description_content_type="text/markdown",
+    author="bnirl_ros maintainers",
+    maintainer="bnirl_ros maintainers",
+    maintainer_email="bnirl-ros@example.com",
+    license="Apache-2.0",
+    license_files=["LICENSE"],
+    keywords=["ROS", "inverse reinforcement learning", "learning from demonstration"],
+    classifiers=[
+        "Intended Audience :: Science/Research",
+        "Operating System :: POSIX :: Linux",
+        "Programming Language :: Python :: 3.11",
+        "Programming Language :: Python :: 3.12",
+        "Topic :: Scientific/Engineering",
+    ],
+    python_requires=">=3.11",
+    packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    data_files=shared_files(),
+    install_requires=REQUIREMENTS,
+    extras_require=EXTRAS,
+    zip_safe=False,
+    entry_points={
+        "console_scripts": [
+            "bnirl = bnirl_ros.cli:main",
+            "replay_node = bnirl_ros.nodes.replay_node:main",
+            "subgoal_node = bnirl_ros.nodes.subgoal_node:main",
+        ],
+    },
+)
