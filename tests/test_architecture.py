@@ -1,4 +1,4 @@
-"""The house has its order: imports go from later rooms to earlier ones, and ROS stays in `nodes`."""
+"""The house keeps its order: later rooms import earlier ones, and ROS stays in `nodes`."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_imports_only_from_earlier_rooms(path: Path) -> None:
 def test_only_nodes_import_ros(path: Path) -> None:
     for name, when_loaded in imports_of(path):
         assert not is_ros(name), f"{label(path)} imports {name}"
-        # The nodes import ROS as soon as they are loaded, so loading them has to wait for the need.
+        # Nodes import ROS as soon as they are loaded, so loading them waits for the need.
         assert not (name.startswith("bnirl_ros.nodes") and when_loaded), (
             f"{label(path)} imports {name} outside of a function"
         )
