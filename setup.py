@@ -36,6 +36,7 @@ EXTRAS = {
         "pytest>=7.4",
         "pytest-timeout>=2.2",
         "ruff>=0.5",
+        "setuptools",  # Python 3.12 has none of its own, and a test reads setup.py.
         "types-PyYAML",
     ],
 }
