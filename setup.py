@@ -5,6 +5,8 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = "bnirl_ros"
+# A symlinked colcon build runs a link to this file in a folder that has no README.
+README = Path(__file__).resolve().parent / "README.md"
 SHARED_FOLDERS = ("launch", "config", "bags", "msg_schemas")
 
 # The lower bounds of what has a rosdep key are the versions of Ubuntu 24.04, on which ROS 2 Jazzy
@@ -59,7 +61,7 @@ setup(
     name=NAME,
     version="0.1.0",
     description="Bayesian nonparametric inverse reinforcement learning for ROS 2",
-    long_description=Path("README.md").read_text(encoding="utf-8"),
+    long_description=README.read_text(encoding="utf-8"),
     long_description_content_type="text/markdown",
     author="bnirl_ros maintainers",
     maintainer="bnirl_ros maintainers",
