@@ -1,0 +1,45 @@
+"""One colour for each rank, told apart by colour-blind readers as well."""
+
+from __future__ import annotations
+
+Colour = tuple[float, float, float]
+"""Red, green and blue, each 0-1, as sRGB."""
+
+UNEXPLAINED: Colour = (0.6, 0.6, 0.6)
+"""Colour of observations that no subgoal explains."""
+
+INK: Colour = (0.11, 0.13, 0.16)
+"""Colour of writing."""
+
+# From the published colour-blind-safe palettes of Okabe & Ito (2008), Paul Tol (2021) and IBM, in
+# the order in which each next one lies farthest from those before it, in OKLab, under normal
+# vision and simulated protanopia and deuteranopia alike (Machado et al. 2009).
+_PALETTE = (
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#88CCEE",
+    "#332288",
+    "#DDCC77",
+    "#648FFF",
+    "#E69F00",
+    "#994F00",
+    "#785EF0",
+    "#56B4E9",
+    "#5D3A9B",
+)
+
+# After the palette come its tints, then its shades: (towards, how far).
+_VARIATIONS: tuple[tuple[float, float], ...] = ((0.0, 0.0), (1.0, 0.45), (0.0, 0.4))
+
+
+def colour_of(rank: int) -> Colour:
+    """Colour of the subgoal of this rank, from 1 on; the first 36 ranks have one of their own."""
+    turn, place = divmod(rank - 1, len(_PALETTE))
+    towards, share = _VARIATIONS[turn % len(_VARIATIONS)]
+    code = _PALETTE[place]
+    red, green, blue = (
+        (1.0 - share) * int(code[start : start + 2], 16) / 255 + share * towards
+        for start in (1, 3, 5)
+    )
+    return red, green, blue

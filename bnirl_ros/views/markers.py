@@ -1,0 +1,145 @@
+"""Subgoals, and what is assigned to them, as RViz and Foxglove draw them.
+
+RViz keys on (ns, id) and keeps what it is not told to delete, so each array starts with a
+DELETEALL and then holds the complete set.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from bnirl_ros.inference.summary import Subgoal, Summary
+from bnirl_ros.maps import GridMap
+from bnirl_ros.mdp.actions import STEPS
+from bnirl_ros.views.colours import INK, Colour, colour_of
+from bnirl_ros.views.messages import ColorRGBA, Header, Marker, MarkerArray, Point, Vector3
+from bnirl_ros.views.stamped import header_of, pose_of
+from bnirl_ros.views.waypoints import headings
+
+SMALLEST = 0.1
+"""Markers grow with the cells, but on fine maps stay as visible as with cells of this edge [m]."""
+
+LABEL_ABOVE = 0.2
+"""Height of a label above its sphere [m], as Nav2's waypoint markers have it."""
+
+STEP_LENGTH = 0.4
+"""Length of an assignment's line, in steps of its action: it ends within its cell."""
+
+STAY_LENGTH = 0.25
+"""Reach along x and y of the cross that stands for staying [cells]: out of a subgoal's sphere."""
+
+
+def subgoal_markers(summary: Summary, grid_map: GridMap, stamp_ns: int) -> MarkerArray:
+    """A sphere, a heading and a label for each subgoal, all with the rank as id.
+
+    Namespaces are `subgoal` (SPHERE), `heading` (ARROW, towards the next subgoal visited, see
+    `waypoints.headings`) and `label` (TEXT_VIEW_FACING, `wp_<rank> <probability>`). The first
+    marker is DELETEALL.
+
+    Args:
+        summary: the posterior; positions are in the map frame [m].
+        grid_map: the map, for its frame and resolution.
+        stamp_ns: stamp of every marker [ns].
+    """
+    header = header_of(grid_map.frame_id, stamp_ns)
+    yaw = headings(summary)
+    size = max(grid_map.resolution, SMALLEST)
+    markers = [_delete_all(header)]
+    for subgoal in summary.subgoals:
+        markers += _markers_of(subgoal, yaw[subgoal.rank], size, header)
+    return MarkerArray(markers=markers)
+
+
+def assignment_markers(summary: Summary, grid_map: GridMap, stamp_ns: int) -> MarkerArray:
+    """For each subgoal one LINE_LIST over the distinct (cell, action) pairs assigned to it.
+
+    A move is a line from the centre of its cell along the action, staying a small cross. The
+    points are in the map frame, the namespace is `assignment`, the id is the rank, the first
+    marker DELETEALL.
+
+    Args:
+        summary: the posterior.
+        grid_map: the map on which the observations lie.
+        stamp_ns: stamp of every marker [ns].
+    """
+    header = header_of(grid_map.frame_id, stamp_ns)
+    markers = [_delete_all(header)]
+    for subgoal in summary.subgoals:
+        pairs = np.unique(
+            summary.observations[summary.rank_of == subgoal.rank, 1:].reshape(-1, 3), axis=0
+        )
+        ends = grid_map.centres_of(_lines(pairs).reshape(-1, 2))
+        markers.append(
+            Marker(
+                header=header,
+                ns="assignment",
+                id=subgoal.rank,
+                type=Marker.LINE_LIST,
+                action=Marker.ADD,
+                scale=Vector3(x=0.08 * grid_map.resolution),
+                color=_opaque(colour_of(subgoal.rank)),
+                points=[Point(x=x, y=y) for x, y in ends.tolist()],
+            )
+        )
+    return MarkerArray(markers=markers)
+
+
+def _delete_all(header: Header) -> Marker:
+    return Marker(header=header, action=Marker.DELETEALL)
+
+
+def _markers_of(subgoal: Subgoal, yaw: float, size: float, header: Header) -> list[Marker]:
+    """The three markers of one subgoal, for cells with an edge of `size` [m]."""
+    radius = 0.3 * size
+    colour = _opaque(colour_of(subgoal.rank))
+    return [
+        Marker(
+            header=header,
+            ns="subgoal",
+            id=subgoal.rank,
+            type=Marker.SPHERE,
+            action=Marker.ADD,
+            pose=pose_of(subgoal.position),
+            scale=Vector3(x=2 * radius, y=2 * radius, z=2 * radius),
+            color=colour,
+        ),
+        Marker(
+            header=header,
+            ns="heading",
+            id=subgoal.rank,
+            type=Marker.ARROW,
+            action=Marker.ADD,
+            pose=pose_of(subgoal.position, yaw),
+            scale=Vector3(x=size, y=0.15 * size, z=0.15 * size),
+            color=colour,
+        ),
+        Marker(
+            header=header,
+            ns="label",
+            id=subgoal.rank,
+            type=Marker.TEXT_VIEW_FACING,
+            action=Marker.ADD,
+            pose=pose_of(subgoal.position, z=radius + LABEL_ABOVE),
+            scale=Vector3(z=0.4 * size),
+            # Seen from above the label lies on its sphere and on free space, which is light.
+            color=_opaque(INK),
+            text=f"wp_{subgoal.rank} {subgoal.probability:.2f}",
+        ),
+    ]
+
+
+def _lines(pairs: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+    """Ends (M, 2, 2) [cells] of the lines that show the pairs (N, 3) of x, y and action index."""
+    cells = pairs[:, :2].astype(np.float64)
+    steps = STEPS[pairs[:, 2]]
+    stays = ~steps.any(axis=1)
+    moves = np.stack([cells, cells + STEP_LENGTH * steps], axis=1)[~stays]
+    arms = STAY_LENGTH * np.array([[[-1, -1], [1, 1]], [[-1, 1], [1, -1]]])
+    crosses = cells[stays][:, np.newaxis, np.newaxis, :] + arms
+    return np.concatenate([moves, crosses.reshape(-1, 2, 2)])
+
+
+def _opaque(colour: Colour) -> ColorRGBA:
+    red, green, blue = colour
+    return ColorRGBA(r=red, g=green, b=blue, a=1.0)

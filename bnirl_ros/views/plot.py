@@ -1,0 +1,388 @@
+"""The picture of a posterior: map, observations by subgoal, subgoals and the way through them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from bnirl_ros.inference.summary import Subgoal, Summary
+from bnirl_ros.maps import GridMap
+from bnirl_ros.mdp.actions import STEPS
+from bnirl_ros.views.colours import INK, UNEXPLAINED, Colour, colour_of
+from bnirl_ros.views.waypoints import subgoals_in_order
+
+_DOTS_PER_INCH = 144
+_POINTS_PER_INCH = 72
+_LONGEST = 7.4  # Longer side of the axes [inch].
+_SHORTEST = 1.6  # Shorter side of the axes, unless the map would be stretched [inch].
+_LEFT, _BOTTOM, _TOP = 0.65, 0.6, 0.5  # Margins around the axes [inch].
+_LEGEND_WIDTH = 3.5  # Room right of the axes [inch].
+_LEGEND_LINE = 0.235  # Height of one line of the legend [inch].
+_LARGEST_LEGEND = 24  # Subgoals that the legend lists.
+
+_BLOCKED: Colour = (0.25, 0.28, 0.33)
+_FREE: Colour = (1.0, 1.0, 1.0)
+_GRID: Colour = (0.92, 0.93, 0.94)
+_ROUTE: Colour = (0.35, 0.38, 0.43)
+
+_ARROWS_FROM = 9.0  # Cells of this edge have room for arrows; smaller ones get dots [pt].
+_SMALLEST_DOT = 2.6  # Diameter [pt].
+
+# An arrow along x from (0, 0) to (1, 0): (along, across as a share of its width) of each corner.
+_ARROW = np.array(
+    [[0.0, 0.5], [0.55, 0.5], [0.55, 1.35], [1.0, 0.0], [0.55, -1.35], [0.55, -0.5], [0.0, -0.5]]
+)
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Sizes of the picture: figure and axes [inch], and the edge of a cell on paper [pt]."""
+
+    figure: tuple[float, float]
+    axes: tuple[float, float]
+    cell: float
+
+
+def draw_summary(
+    summary: Summary, grid_map: GridMap, path: str | Path, title: str | None = None
+) -> None:
+    """Write the picture of a posterior as a PNG file.
+
+    Shown are the map (blocked cells dark); each distinct (cell, action) pair of the observations,
+    as an arrow along the action or a dot for staying, coloured by the subgoal to which the mode
+    assigns it and the wider the more often it occurs (on maps too fine for arrows, a dot); the
+    subgoals with their rank, with their probability beside it; and the order in which they were
+    first visited, as arrows from one to the next. Axes are in cells.
+
+    Args:
+        summary: the posterior.
+        grid_map: the map on which it lies.
+        path: the file to write.
+        title: a line above the picture.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    # Only here, since importing it takes longer than most inferences; and without pyplot, which
+    # would keep the figure, and may look for a screen.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    layout = _layout(grid_map, len(summary.subgoals))
+    width, height = layout.figure
+    figure = Figure(figsize=layout.figure, dpi=_DOTS_PER_INCH, facecolor="white")
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_axes(
+        (
+            _LEFT / width,
+            (height - _TOP - layout.axes[1]) / height,
+            layout.axes[0] / width,
+            layout.axes[1] / height,
+        )
+    )
+    _draw_map(axes, grid_map, layout)
+    _draw_observations(axes, summary, layout)
+    _draw_route(axes, summary, layout)
+    _draw_subgoals(axes, summary, layout)
+    _draw_legend(figure, summary, layout)
+    if title is not None:
+        figure.text(
+            _LEFT / width,
+            1.0 - 0.6 * _TOP / height,
+            title,
+            fontsize=12,
+            fontweight="bold",
+            color=INK,
+            verticalalignment="center",
+        )
+    with Path(path).open("wb") as file:
+        canvas.print_png(file, metadata={"Software": None})
+
+
+def _layout(grid_map: GridMap, subgoals: int) -> _Layout:
+    rows, columns = grid_map.free.shape
+    # A longish map is as long as there is room, a square one smaller: about the same area.
+    longest = _LONGEST * min(1.0, 0.78 * math.sqrt(max(rows, columns) / min(rows, columns)))
+    inches = longest / max(rows, columns)
+    axes = (max(columns * inches, _SHORTEST), max(rows * inches, _SHORTEST))
+    legend = _LEGEND_LINE * (min(subgoals, _LARGEST_LEGEND) + 5)
+    figure = (
+        _LEFT + axes[0] + _LEGEND_WIDTH,
+        _TOP + max(axes[1] + _BOTTOM, legend),
+    )
+    return _Layout(figure, axes, inches * _POINTS_PER_INCH)
+
+
+def _draw_map(axes: Any, grid_map: GridMap, layout: _Layout) -> None:
+    rows, columns = grid_map.free.shape
+    image = np.where(grid_map.free[..., np.newaxis], _FREE, _BLOCKED)
+    axes.imshow(
+        image,
+        origin="lower",
+        extent=(-0.5, columns - 0.5, -0.5, rows - 0.5),
+        interpolation="nearest" if layout.cell >= 2 else "antialiased",
+        aspect="equal",
+    )
+    if layout.cell >= _ARROWS_FROM:
+        axes.vlines(np.arange(columns - 1) + 0.5, -0.5, rows - 0.5, colors=[_GRID], linewidth=0.6)
+        axes.hlines(np.arange(rows - 1) + 0.5, -0.5, columns - 0.5, colors=[_GRID], linewidth=0.6)
+    from matplotlib.ticker import MaxNLocator
+
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True, min_n_ticks=1))
+    axes.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True, min_n_ticks=1))
+    axes.tick_params(labelsize=8.5, length=3, color=_ROUTE, labelcolor=INK)
+    axes.set_xlabel(f"x [cells of {grid_map.resolution:.4g} m]", fontsize=9, color=INK)
+    axes.set_ylabel("y [cells]", fontsize=9, color=INK)
+    axes.set_xlim(-0.5, columns - 0.5)
+    axes.set_ylim(-0.5, rows - 0.5)
+    for spine in axes.spines.values():
+        spine.set_color(_ROUTE)
+        spine.set_linewidth(0.8)
+
+
+def _draw_observations(axes: Any, summary: Summary, layout: _Layout) -> None:
+    keys = np.column_stack([summary.observations[:, 1:], summary.rank_of])
+    distinct, counts = np.unique(keys.reshape(-1, 4), axis=0, return_counts=True)
+    # Widest first: where two subgoals share a (cell, action) pair, both can be seen.
+    order = np.argsort(-counts, kind="stable")
+    distinct, counts = distinct[order], counts[order]
+    ranks = {subgoal.rank for subgoal in summary.subgoals}
+    colours = np.array(
+        [colour_of(rank) if rank in ranks else UNEXPLAINED for rank in distinct[:, 3].tolist()]
+    ).reshape(-1, 3)
+    share = np.sqrt(counts / max(counts.max(initial=1), 1))
+    steps = STEPS[distinct[:, 2]]
+    if layout.cell < _ARROWS_FROM:
+        diameter = max(_SMALLEST_DOT, 0.8 * layout.cell)
+        axes.scatter(
+            distinct[:, 0], distinct[:, 1], s=diameter**2, c=colours, linewidths=0, zorder=3
+        )
+        return
+    from matplotlib.collections import PolyCollection
+
+    moves = steps.any(axis=1)
+    axes.add_collection(
+        PolyCollection(
+            _arrows(distinct[moves, :2], steps[moves], 0.05 + 0.15 * share[moves]),
+            facecolors=colours[moves],
+            edgecolors="white",
+            linewidths=0.3,
+            zorder=3,
+        )
+    )
+    diameter = (0.16 + 0.24 * share[~moves]) * layout.cell
+    axes.scatter(
+        distinct[~moves, 0],
+        distinct[~moves, 1],
+        s=diameter**2,
+        c=colours[~moves],
+        edgecolors="white",
+        linewidths=0.3,
+        zorder=3.1,
+    )
+
+
+def _arrows(
+    cells: npt.NDArray[np.int64], steps: npt.NDArray[np.int64], widths: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """Outlines (N, 7, 2) [cells] of arrows from the cells (N, 2) along their steps (N, 2)."""
+    length = np.linalg.norm(steps, axis=1, keepdims=True)
+    along = steps / length
+    across = np.column_stack([-along[:, 1], along[:, 0]])
+    return np.asarray(
+        cells[:, np.newaxis, :]
+        + 0.46 * _ARROW[:, :1] * (along * np.sqrt(length))[:, np.newaxis, :]
+        + _ARROW[:, 1:] * (across * widths[:, np.newaxis])[:, np.newaxis, :]
+    )
+
+
+def _draw_route(axes: Any, summary: Summary, layout: _Layout) -> None:
+    from matplotlib.patches import FancyArrowPatch
+
+    for here, there in pairwise(subgoals_in_order(summary)):
+        axes.add_patch(
+            FancyArrowPatch(
+                here.cell,
+                there.cell,
+                connectionstyle="arc3,rad=0.14",
+                arrowstyle="-|>,head_length=5,head_width=2.6",
+                shrinkA=_marker(layout) / 2 + 1,
+                shrinkB=_marker(layout) / 2 + 2,
+                linewidth=1.3,
+                linestyle=(0, (4, 2)),
+                color=_ROUTE,
+                zorder=4,
+            )
+        )
+
+
+def _marker(layout: _Layout) -> float:
+    """Diameter of a subgoal's marker [pt]: it holds two digits."""
+    return min(max(0.5 * layout.cell, 15.0), 22.0)
+
+
+def _draw_subgoals(axes: Any, summary: Summary, layout: _Layout) -> None:
+    from matplotlib.patheffects import withStroke
+
+    size = _marker(layout)
+    tags = _tag_places(summary.subgoals, layout, size)
+    for subgoal, (right, up) in zip(summary.subgoals, tags, strict=True):
+        colour = colour_of(subgoal.rank)
+        axes.plot(
+            *subgoal.cell,
+            marker="o",
+            markersize=size,
+            color=colour,
+            markeredgecolor="white",
+            markeredgewidth=1.4,
+            zorder=5,
+        )
+        axes.annotate(
+            str(subgoal.rank),
+            subgoal.cell,
+            horizontalalignment="center",
+            verticalalignment="center_baseline",
+            fontsize=0.52 * size,
+            fontweight="bold",
+            color=_writing_on(colour),
+            zorder=6,
+        )
+        axes.annotate(
+            f"{subgoal.probability:.2f}",
+            subgoal.cell,
+            xytext=(right, up),
+            textcoords="offset points",
+            horizontalalignment="center",
+            verticalalignment="center",
+            fontsize=8.5,
+            color=INK,
+            path_effects=[withStroke(linewidth=2.6, foreground="white")],
+            zorder=7,
+        )
+
+
+def _writing_on(colour: Colour) -> Colour:
+    """Ink or white, whichever stands out more (relative luminance of WCAG 2)."""
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in colour]
+    luminance = 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+    return (1.0, 1.0, 1.0) if luminance < 0.26 else INK
+
+
+def _tag_places(
+    subgoals: tuple[Subgoal, ...], layout: _Layout, size: float
+) -> Iterator[tuple[float, float]]:
+    """Where each subgoal's probability goes, right and up of its centre [pt].
+
+    Each takes the first of eight places around its marker where it covers least of the markers
+    and of the probabilities placed before it, within the axes.
+    """
+    width, height = 24.0, 11.0
+    frame = np.array(layout.axes) * _POINTS_PER_INCH
+    centres = (np.array([subgoal.cell for subgoal in subgoals]).reshape(-1, 2) + 0.5) * layout.cell
+    taken = [(centre, np.array([size, size])) for centre in centres]
+    aside, above = (size + width) / 2 + 1, (size + height) / 2 + 1
+    places = np.array(
+        [(0, above), (0, -above), (aside, 0), (-aside, 0)]
+        + [(x * aside * 0.8, y * above * 0.8) for y in (1, -1) for x in (1, -1)]
+    )
+    box = np.array([width, height])
+    for centre in centres:
+        costs = []
+        for place in places:
+            apart = np.abs([centre + place - other for other, _ in taken])
+            overlap = np.clip([(box + b) / 2 for _, b in taken] - apart, 0.0, None).prod(axis=1)
+            low, high = centre + place - box / 2, centre + place + box / 2
+            outside = np.clip(-low, 0.0, None).sum() + np.clip(high - frame, 0.0, None).sum()
+            costs.append(overlap.sum() + 100.0 * outside)
+        best = places[int(np.argmin(costs))]
+        taken.append((centre + best, box))
+        yield float(best[0]), float(best[1])
+
+
+def _draw_legend(figure: Any, summary: Summary, layout: _Layout) -> None:
+    """The table of the subgoals and the key of the signs, right of the axes."""
+    width, height = layout.figure
+    legend = figure.add_axes((0, 0, 1, 1))
+    legend.set_axis_off()
+    legend.set_xlim(0, width)
+    legend.set_ylim(height, 0)
+    left = _LEFT + layout.axes[0] + 0.3
+    columns = (left + 0.12, left + 0.87, left + 1.62, left + 2.42, left + 2.95)
+
+    def write(x: float, y: float, text: str, faint: bool = False, right: bool = True) -> None:
+        legend.text(
+            x,
+            y,
+            text,
+            fontsize=8.5,
+            color=_ROUTE if faint else INK,
+            horizontalalignment="right" if right else "left",
+            verticalalignment="center_baseline",
+        )
+
+    y = _TOP + 0.1
+    names = ("cell", "probability", "observations", "order")
+    for x, name in zip(columns[1:], names, strict=True):
+        write(x, y, name, faint=True)
+    order = {rank: position for position, rank in enumerate(summary.visit_sequence, start=1)}
+    for subgoal in summary.subgoals[:_LARGEST_LEGEND]:
+        y += _LEGEND_LINE
+        colour = colour_of(subgoal.rank)
+        legend.plot(columns[0], y, marker="o", markersize=13, color=colour, markeredgewidth=0)
+        legend.text(
+            columns[0],
+            y,
+            str(subgoal.rank),
+            fontsize=7.5,
+            fontweight="bold",
+            color=_writing_on(colour),
+            horizontalalignment="center",
+            verticalalignment="center_baseline",
+        )
+        texts = (
+            "({}, {})".format(*subgoal.cell),
+            f"{subgoal.probability:.2f}",
+            str(subgoal.observations),
+            str(order.get(subgoal.rank, "-")),
+        )
+        for x, text in zip(columns[1:], texts, strict=True):
+            write(x, y, text)
+    if len(summary.subgoals) > _LARGEST_LEGEND:
+        y += _LEGEND_LINE
+        more = len(summary.subgoals) - _LARGEST_LEGEND
+        write(left, y, f"and {more} more", faint=True, right=False)
+    y += 1.6 * _LEGEND_LINE
+    key = columns[0] + 0.28
+    if len(summary.visit_sequence) > 1:
+        legend.annotate(
+            "",
+            xy=(columns[0] + 0.16, y),
+            xytext=(columns[0] - 0.16, y),
+            arrowprops={
+                "arrowstyle": "-|>,head_length=0.35,head_width=0.2",
+                "color": _ROUTE,
+                "linewidth": 1.3,
+            },
+        )
+        write(key, y, "order of the first visits", faint=True, right=False)
+        y += _LEGEND_LINE
+    legend.plot(columns[0], y, marker="o", markersize=4, color=colour_of(1), markeredgewidth=0)
+    write(key, y, _key_of_observations(layout), faint=True, right=False)
+    ranks = [subgoal.rank for subgoal in summary.subgoals]
+    if not np.isin(summary.rank_of, ranks).all():
+        y += _LEGEND_LINE
+        legend.plot(columns[0], y, marker="o", markersize=4, color=UNEXPLAINED, markeredgewidth=0)
+        write(key, y, "explained by no subgoal", faint=True, right=False)
+
+
+def _key_of_observations(layout: _Layout) -> str:
+    if layout.cell < _ARROWS_FROM:
+        return "an observation, in its subgoal's colour"
+    return "observed: dot for stay, arrow for a move"
