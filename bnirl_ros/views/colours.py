@@ -5,15 +5,15 @@ from __future__ import annotations
 Colour = tuple[float, float, float]
 """Red, green and blue, each 0-1, as sRGB."""
 
-UNEXPLAINED: Colour = (0.6, 0.6, 0.6)
+UNEXPLAINED: Colour = (0.68, 0.68, 0.68)
 """Colour of observations that no subgoal explains."""
 
 INK: Colour = (0.11, 0.13, 0.16)
 """Colour of writing."""
 
-# From the published colour-blind-safe palettes of Okabe & Ito (2008), Paul Tol (2021) and IBM, in
-# the order in which each next one lies farthest from those before it, in OKLab, under normal
-# vision and simulated protanopia and deuteranopia alike (Machado et al. 2009).
+# Taken from the published colour-blind-safe palettes of Okabe & Ito (2008), Paul Tol (2021) and
+# IBM: blue, vermilion and green, then always the one farthest from those before it in OKLab, the
+# nearest of normal vision and simulated protanopia and deuteranopia counting. A test measures it.
 _PALETTE = (
     "#0072B2",
     "#D55E00",

@@ -22,8 +22,10 @@ _DOTS_PER_INCH = 144
 _POINTS_PER_INCH = 72
 _LONGEST = 7.4  # Longer side of the axes [inch].
 _SHORTEST = 1.6  # Shorter side of the axes, unless the map would be stretched [inch].
-_LEFT, _BOTTOM, _TOP = 0.65, 0.6, 0.5  # Margins around the axes [inch].
-_LEGEND_WIDTH = 3.5  # Room right of the axes [inch].
+_LEFT, _BOTTOM = 0.65, 0.6  # Margins beside and below the axes [inch].
+_TOP, _TITLED_TOP = 0.2, 0.5  # Margin above them, without and with a title [inch].
+_BEND = 0.14  # How far the way from one subgoal to the next bows, as a share of its length.
+_LEGEND_WIDTH = 3.85  # Room right of the axes [inch].
 _LEGEND_LINE = 0.235  # Height of one line of the legend [inch].
 _LARGEST_LEGEND = 24  # Subgoals that the legend lists.
 
@@ -43,10 +45,11 @@ _ARROW = np.array(
 
 @dataclass(frozen=True)
 class _Layout:
-    """Sizes of the picture: figure and axes [inch], and the edge of a cell on paper [pt]."""
+    """Sizes of the picture: figure, axes and top margin [inch], a cell's edge on paper [pt]."""
 
     figure: tuple[float, float]
     axes: tuple[float, float]
+    top: float
     cell: float
 
 
@@ -75,14 +78,14 @@ def draw_summary(
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    layout = _layout(grid_map, len(summary.subgoals))
+    layout = _layout(grid_map, len(summary.subgoals), _TOP if title is None else _TITLED_TOP)
     width, height = layout.figure
     figure = Figure(figsize=layout.figure, dpi=_DOTS_PER_INCH, facecolor="white")
-    canvas = FigureCanvasAgg(figure)
+    canvas: Any = FigureCanvasAgg(figure)
     axes = figure.add_axes(
         (
             _LEFT / width,
-            (height - _TOP - layout.axes[1]) / height,
+            (height - layout.top - layout.axes[1]) / height,
             layout.axes[0] / width,
             layout.axes[1] / height,
         )
@@ -95,7 +98,7 @@ def draw_summary(
     if title is not None:
         figure.text(
             _LEFT / width,
-            1.0 - 0.6 * _TOP / height,
+            1.0 - 0.6 * layout.top / height,
             title,
             fontsize=12,
             fontweight="bold",
@@ -106,7 +109,7 @@ def draw_summary(
         canvas.print_png(file, metadata={"Software": None})
 
 
-def _layout(grid_map: GridMap, subgoals: int) -> _Layout:
+def _layout(grid_map: GridMap, subgoals: int, top: float) -> _Layout:
     rows, columns = grid_map.free.shape
     # A longish map is as long as there is room, a square one smaller: about the same area.
     longest = _LONGEST * min(1.0, 0.78 * math.sqrt(max(rows, columns) / min(rows, columns)))
@@ -115,9 +118,9 @@ def _layout(grid_map: GridMap, subgoals: int) -> _Layout:
     legend = _LEGEND_LINE * (min(subgoals, _LARGEST_LEGEND) + 5)
     figure = (
         _LEFT + axes[0] + _LEGEND_WIDTH,
-        _TOP + max(axes[1] + _BOTTOM, legend),
+        top + max(axes[1] + _BOTTOM, legend),
     )
-    return _Layout(figure, axes, inches * _POINTS_PER_INCH)
+    return _Layout(figure, axes, top, inches * _POINTS_PER_INCH)
 
 
 def _draw_map(axes: Any, grid_map: GridMap, layout: _Layout) -> None:
@@ -148,45 +151,62 @@ def _draw_map(axes: Any, grid_map: GridMap, layout: _Layout) -> None:
 
 
 def _draw_observations(axes: Any, summary: Summary, layout: _Layout) -> None:
-    keys = np.column_stack([summary.observations[:, 1:], summary.rank_of])
-    distinct, counts = np.unique(keys.reshape(-1, 4), axis=0, return_counts=True)
-    # Widest first: where two subgoals share a (cell, action) pair, both can be seen.
-    order = np.argsort(-counts, kind="stable")
-    distinct, counts = distinct[order], counts[order]
-    ranks = {subgoal.rank for subgoal in summary.subgoals}
-    colours = np.array(
-        [colour_of(rank) if rank in ranks else UNEXPLAINED for rank in distinct[:, 3].tolist()]
-    ).reshape(-1, 3)
-    share = np.sqrt(counts / max(counts.max(initial=1), 1))
+    keys = np.column_stack([summary.observations[:, 1:], summary.rank_of]).reshape(-1, 4)
+    distinct, counts = np.unique(keys, axis=0, return_counts=True)
+    known = {subgoal.rank: colour_of(subgoal.rank) for subgoal in summary.subgoals}
+    colours = np.array([known.get(rank, UNEXPLAINED) for rank in distinct[:, 3].tolist()]).reshape(
+        -1, 3
+    )
     steps = STEPS[distinct[:, 2]]
     if layout.cell < _ARROWS_FROM:
         diameter = max(_SMALLEST_DOT, 0.8 * layout.cell)
+        seen_last = np.argsort(counts, kind="stable")  # The most frequent one lies on top.
         axes.scatter(
-            distinct[:, 0], distinct[:, 1], s=diameter**2, c=colours, linewidths=0, zorder=3
+            *distinct[seen_last, :2].T,
+            s=diameter**2,
+            c=colours[seen_last],
+            linewidths=0,
+            zorder=3,
         )
         return
     from matplotlib.collections import PolyCollection
 
+    # Where several subgoals share a (cell, action) pair, each next one lies on the one before it
+    # and is slimmer, so that all are seen.
+    turn = _turns(distinct[:, :3], counts)
+    width = np.sqrt(counts / counts.max(initial=1)) * 0.6**turn
     moves = steps.any(axis=1)
-    axes.add_collection(
-        PolyCollection(
-            _arrows(distinct[moves, :2], steps[moves], 0.05 + 0.15 * share[moves]),
-            facecolors=colours[moves],
+    for layer in range(turn.max(initial=-1) + 1):
+        move, stay = moves & (turn == layer), ~moves & (turn == layer)
+        outlines = _arrows(distinct[move, :2], steps[move], 0.04 + 0.16 * width[move])
+        axes.add_collection(
+            PolyCollection(
+                list(outlines),
+                facecolors=colours[move],
+                edgecolors="white",
+                linewidths=0.3,
+                zorder=3,
+            )
+        )
+        axes.scatter(
+            *distinct[stay, :2].T,
+            s=((0.14 + 0.26 * width[stay]) * layout.cell) ** 2,
+            c=colours[stay],
             edgecolors="white",
             linewidths=0.3,
-            zorder=3,
+            zorder=3.1,
         )
-    )
-    diameter = (0.16 + 0.24 * share[~moves]) * layout.cell
-    axes.scatter(
-        distinct[~moves, 0],
-        distinct[~moves, 1],
-        s=diameter**2,
-        c=colours[~moves],
-        edgecolors="white",
-        linewidths=0.3,
-        zorder=3.1,
-    )
+
+
+def _turns(pairs: npt.NDArray[np.int64], counts: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """For each of the sorted pairs (N, 3) its place among its equals, the most frequent first."""
+    new = np.ones(len(pairs), dtype=bool)
+    new[1:] = (pairs[1:] != pairs[:-1]).any(axis=1)
+    group = np.cumsum(new) - 1
+    order = np.lexsort((-counts, group))
+    turn = np.empty(len(pairs), dtype=np.int64)
+    turn[order] = np.arange(len(pairs)) - np.flatnonzero(new)[group]
+    return turn
 
 
 def _arrows(
@@ -205,22 +225,54 @@ def _arrows(
 
 def _draw_route(axes: Any, summary: Summary, layout: _Layout) -> None:
     from matplotlib.patches import FancyArrowPatch
+    from matplotlib.patheffects import withStroke
 
-    for here, there in pairwise(subgoals_in_order(summary)):
+    order = subgoals_in_order(summary)
+    opacity = max(0.35, min(1.0, 8 / max(len(order), 1)))  # Many ways must not hide the map.
+    for number, (here, there) in enumerate(pairwise(order), start=2):
         axes.add_patch(
             FancyArrowPatch(
                 here.cell,
                 there.cell,
-                connectionstyle="arc3,rad=0.14",
+                connectionstyle=f"arc3,rad={_BEND}",
                 arrowstyle="-|>,head_length=5,head_width=2.6",
                 shrinkA=_marker(layout) / 2 + 1,
                 shrinkB=_marker(layout) / 2 + 2,
                 linewidth=1.3,
                 linestyle=(0, (4, 2)),
                 color=_ROUTE,
+                alpha=opacity,
+                path_effects=[withStroke(linewidth=3, foreground="white", alpha=0.6 * opacity)],
                 zorder=4,
             )
         )
+        _write_order(axes, _middle_of_way(here, there), number)
+
+
+def _middle_of_way(here: Subgoal, there: Subgoal) -> npt.NDArray[np.float64]:
+    """The place (x, y) [cells] halfway along the bowed way between two subgoals."""
+    start, end = np.array(here.cell), np.array(there.cell)
+    right, up = end - start
+    return np.asarray((start + end + _BEND * np.array([up, -right])) / 2)
+
+
+def _write_order(axes: Any, place: npt.NDArray[np.float64], number: int) -> None:
+    """The number of a way: the place in the visit sequence to which it leads."""
+    axes.text(
+        *place,
+        str(number),
+        fontsize=7,
+        color=_ROUTE,
+        horizontalalignment="center",
+        verticalalignment="center_baseline",
+        bbox={
+            "boxstyle": "circle,pad=0.18",
+            "facecolor": "white",
+            "edgecolor": _ROUTE,
+            "linewidth": 0.7,
+        },
+        zorder=4.5,
+    )
 
 
 def _marker(layout: _Layout) -> float:
@@ -232,7 +284,7 @@ def _draw_subgoals(axes: Any, summary: Summary, layout: _Layout) -> None:
     from matplotlib.patheffects import withStroke
 
     size = _marker(layout)
-    tags = _tag_places(summary.subgoals, layout, size)
+    tags = _tag_places(summary, layout, size)
     for subgoal, (right, up) in zip(summary.subgoals, tags, strict=True):
         colour = colour_of(subgoal.rank)
         axes.plot(
@@ -242,6 +294,7 @@ def _draw_subgoals(axes: Any, summary: Summary, layout: _Layout) -> None:
             color=colour,
             markeredgecolor="white",
             markeredgewidth=1.4,
+            clip_on=False,
             zorder=5,
         )
         axes.annotate(
@@ -275,18 +328,22 @@ def _writing_on(colour: Colour) -> Colour:
     return (1.0, 1.0, 1.0) if luminance < 0.26 else INK
 
 
-def _tag_places(
-    subgoals: tuple[Subgoal, ...], layout: _Layout, size: float
-) -> Iterator[tuple[float, float]]:
+def _tag_places(summary: Summary, layout: _Layout, size: float) -> Iterator[tuple[float, float]]:
     """Where each subgoal's probability goes, right and up of its centre [pt].
 
-    Each takes the first of eight places around its marker where it covers least of the markers
-    and of the probabilities placed before it, within the axes.
+    Each takes the first of eight places around its marker where it covers least of the markers,
+    of the numbers of the ways and of the probabilities placed before it, within the axes.
     """
-    width, height = 24.0, 11.0
+    width, height, number = 24.0, 11.0, 11.0
     frame = np.array(layout.axes) * _POINTS_PER_INCH
-    centres = (np.array([subgoal.cell for subgoal in subgoals]).reshape(-1, 2) + 0.5) * layout.cell
+
+    def on_paper(cell: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        return (np.asarray(cell, dtype=np.float64) + 0.5) * layout.cell
+
+    centres = [on_paper(subgoal.cell) for subgoal in summary.subgoals]
     taken = [(centre, np.array([size, size])) for centre in centres]
+    for here, there in pairwise(subgoals_in_order(summary)):
+        taken.append((on_paper(_middle_of_way(here, there)), np.array([number, number])))
     aside, above = (size + width) / 2 + 1, (size + height) / 2 + 1
     places = np.array(
         [(0, above), (0, -above), (aside, 0), (-aside, 0)]
@@ -313,8 +370,8 @@ def _draw_legend(figure: Any, summary: Summary, layout: _Layout) -> None:
     legend.set_axis_off()
     legend.set_xlim(0, width)
     legend.set_ylim(height, 0)
-    left = _LEFT + layout.axes[0] + 0.3
-    columns = (left + 0.12, left + 0.87, left + 1.62, left + 2.42, left + 2.95)
+    left = _LEFT + layout.axes[0] + 0.35
+    columns = (left + 0.12, left + 1.05, left + 1.85, left + 2.8, left + 3.3)
 
     def write(x: float, y: float, text: str, faint: bool = False, right: bool = True) -> None:
         legend.text(
@@ -327,7 +384,7 @@ def _draw_legend(figure: Any, summary: Summary, layout: _Layout) -> None:
             verticalalignment="center_baseline",
         )
 
-    y = _TOP + 0.1
+    y = layout.top + 0.1
     names = ("cell", "probability", "observations", "order")
     for x, name in zip(columns[1:], names, strict=True):
         write(x, y, name, faint=True)
@@ -359,19 +416,20 @@ def _draw_legend(figure: Any, summary: Summary, layout: _Layout) -> None:
         more = len(summary.subgoals) - _LARGEST_LEGEND
         write(left, y, f"and {more} more", faint=True, right=False)
     y += 1.6 * _LEGEND_LINE
-    key = columns[0] + 0.28
+    key = columns[0] + 0.34
     if len(summary.visit_sequence) > 1:
         legend.annotate(
             "",
-            xy=(columns[0] + 0.16, y),
-            xytext=(columns[0] - 0.16, y),
+            xy=(columns[0] + 0.22, y),
+            xytext=(columns[0] - 0.22, y),
             arrowprops={
                 "arrowstyle": "-|>,head_length=0.35,head_width=0.2",
                 "color": _ROUTE,
                 "linewidth": 1.3,
             },
         )
-        write(key, y, "order of the first visits", faint=True, right=False)
+        _write_order(legend, np.array([columns[0] - 0.04, y]), 2)
+        write(key, y, "order in which they were first visited", faint=True, right=False)
         y += _LEGEND_LINE
     legend.plot(columns[0], y, marker="o", markersize=4, color=colour_of(1), markeredgewidth=0)
     write(key, y, _key_of_observations(layout), faint=True, right=False)

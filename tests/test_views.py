@@ -1,0 +1,406 @@
+"""Every view against its contract, on one small posterior over a turned map."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from bnirl_ros.inference.summary import Subgoal, Summary
+from bnirl_ros.maps import GridMap, map_from_occupancy, yaw_of
+from bnirl_ros.mdp.actions import ACTION_NAMES
+from bnirl_ros.views.belief import belief_grid, map_message
+from bnirl_ros.views.colours import UNEXPLAINED, colour_of
+from bnirl_ros.views.demonstration import action_message, pose_message
+from bnirl_ros.views.markers import assignment_markers, subgoal_markers
+from bnirl_ros.views.messages import Marker, MarkerArray, Pose
+from bnirl_ros.views.plot import draw_summary
+from bnirl_ros.views.tables import subgoal_table
+from bnirl_ros.views.waypoints import headings, waypoint_path
+
+STAMP = 12_345_678_901
+YAW = math.pi / 2
+STAY, EAST, NORTH_EAST = (ACTION_NAMES.index(name) for name in ("stay", "E", "NE"))
+
+
+@pytest.fixture
+def grid_map() -> GridMap:
+    """5 x 3 cells of 0.5 m, turned by a quarter: x of the map points along y of the frame."""
+    free = np.ones((3, 5), dtype=bool)
+    free[1, 1] = False
+    return GridMap(free, 0.5, (10.0, 20.0, YAW), "odom")
+
+
+@pytest.fixture
+def summary(grid_map: GridMap) -> Summary:
+    """Three subgoals visited in the order 2, 1, 3; five observations, one of them repeated."""
+    cells = {1: (4, 2), 2: (0, 0), 3: (4, 0)}
+    probability = {1: 1.0, 2: 0.994, 3: 0.5}
+    visits = {1: (2,), 2: (1, 3), 3: (4,)}
+    rank_of = np.array([1, 1, 1, 2, 3])
+    belief = np.zeros(grid_map.free.shape)
+    for rank, (x, y) in cells.items():
+        belief[y, x] = probability[rank]
+    return Summary(
+        subgoals=tuple(
+            Subgoal(
+                rank,
+                cells[rank],
+                tuple(grid_map.centres_of([cells[rank]])[0].tolist()),
+                probability[rank],
+                int((rank_of == rank).sum()),
+                visits[rank],
+            )
+            for rank in cells
+        ),
+        visit_sequence=(2, 1, 3),
+        observations=np.array(
+            [
+                [0, 2, 1, NORTH_EAST],
+                [0, 2, 1, NORTH_EAST],
+                [0, 3, 2, EAST],
+                [0, 0, 0, STAY],
+                [1, 3, 0, EAST],
+            ]
+        ),
+        rank_of=rank_of,
+        cell_probability=belief,
+        rhat=1.0,
+        ess=100.0,
+        chains=4,
+        draws=800,
+    )
+
+
+def numbers(value: object) -> Iterator[float]:
+    """Every float within a message."""
+    if dataclasses.is_dataclass(value):
+        for each in dataclasses.fields(value):
+            yield from numbers(getattr(value, each.name))
+    elif isinstance(value, list):
+        for item in value:
+            yield from numbers(item)
+    elif isinstance(value, float):
+        yield value
+
+
+def yaw_in(pose: Pose) -> float:
+    turn = pose.orientation
+    return yaw_of(turn.x, turn.y, turn.z, turn.w, "pose")
+
+
+@pytest.mark.parametrize("view", [subgoal_markers, assignment_markers])
+def test_markers_are_a_complete_set_that_rviz_accepts(view, summary, grid_map):
+    array: MarkerArray = view(summary, grid_map, STAMP)
+    first, *others = array.markers
+    assert (first.action, first.ns, first.header.frame_id) == (Marker.DELETEALL, "", "odom")
+    keys = [(marker.ns, marker.id) for marker in others]
+    assert len(set(keys)) == len(keys)
+    assert {marker.id for marker in others} == {1, 2, 3}
+    for marker in others:
+        assert marker.action == Marker.ADD
+        assert marker.header.frame_id == "odom"
+        assert (marker.header.stamp.sec, marker.header.stamp.nanosec) == (12, 345_678_901)
+        assert (marker.lifetime.sec, marker.lifetime.nanosec) == (0, 0)
+        colour = marker.color
+        assert all(0 <= part <= 1 for part in (colour.r, colour.g, colour.b))
+        assert colour.a == 1
+        turn = marker.pose.orientation
+        assert math.hypot(turn.x, turn.y, turn.z, turn.w) == pytest.approx(1.0)
+    assert all(math.isfinite(number) for number in numbers(array))
+
+
+def test_each_subgoal_has_a_sphere_a_heading_and_a_label(summary, grid_map):
+    by_key = {(m.ns, m.id): m for m in subgoal_markers(summary, grid_map, STAMP).markers[1:]}
+    assert len(by_key) == 9
+    for subgoal in summary.subgoals:
+        sphere, heading, label = (
+            by_key[name, subgoal.rank] for name in ("subgoal", "heading", "label")
+        )
+        assert (sphere.type, heading.type, label.type) == (
+            Marker.SPHERE,
+            Marker.ARROW,
+            Marker.TEXT_VIEW_FACING,
+        )
+        for marker in (sphere, heading, label):
+            position = marker.pose.position
+            assert (position.x, position.y) == pytest.approx(subgoal.position)
+        assert sphere.scale.x == sphere.scale.y == sphere.scale.z > 0
+        assert heading.scale.x > sphere.scale.x / 2  # or it would be hidden inside the sphere
+        assert label.pose.position.z == pytest.approx(sphere.scale.z / 2 + 0.2)
+        assert label.scale.z > 0
+    assert [by_key["label", rank].text for rank in (1, 2, 3)] == [
+        "wp_1 1.00",
+        "wp_2 0.99",
+        "wp_3 0.50",
+    ]
+
+
+def test_markers_stay_visible_on_a_fine_map_and_grow_with_coarse_cells(summary, grid_map):
+    sizes = [
+        subgoal_markers(summary, dataclasses.replace(grid_map, resolution=resolution), STAMP)
+        .markers[1]
+        .scale.x
+        for resolution in (0.01, 0.05, 1.0, 2.0)
+    ]
+    assert sizes[0] == sizes[1] == pytest.approx(0.06)
+    assert sizes[2:] == pytest.approx([0.6, 1.2])
+
+
+def test_a_subgoal_heads_for_the_next_one_and_the_last_keeps_its_direction(summary, grid_map):
+    # On the map: from (0, 0) to (4, 2), then down to (4, 0); the map is turned by a quarter.
+    expected = {2: YAW + math.atan2(2, 4), 1: YAW - math.pi / 2, 3: YAW - math.pi / 2}
+    assert headings(summary) == pytest.approx(expected)
+    arrows = {
+        m.id: m for m in subgoal_markers(summary, grid_map, STAMP).markers if m.ns == "heading"
+    }
+    for rank, yaw in expected.items():
+        assert yaw_in(arrows[rank].pose) == pytest.approx(yaw)
+
+
+def test_a_subgoal_alone_heads_along_x(summary):
+    alone = dataclasses.replace(summary, subgoals=summary.subgoals[:1], visit_sequence=(1,))
+    assert headings(alone) == {1: 0.0}
+
+
+def test_assignments_are_lines_over_distinct_pairs_in_the_map_frame(summary, grid_map):
+    of_rank = {m.id: m for m in assignment_markers(summary, grid_map, STAMP).markers[1:]}
+    for rank, marker in of_rank.items():
+        assert (marker.type, marker.ns) == (Marker.LINE_LIST, "assignment")
+        assert len(marker.points) % 2 == 0
+        assert marker.scale.x > 0
+        assert (marker.color.r, marker.color.g, marker.color.b) == colour_of(rank)
+        assert yaw_in(marker.pose) == 0.0  # the points themselves are turned
+    # Three observations of rank 1, two of them the same: two lines.
+    ends = np.array([(point.x, point.y) for point in of_rank[1].points])
+    starts = grid_map.centres_of([[2, 1], [3, 2]])
+    assert ends[::2] == pytest.approx(starts)
+    # North-east and east on the map are north-west and north in a frame seen from above.
+    assert ends[1::2] - ends[::2] == pytest.approx(np.array([[-0.2, 0.2], [0.0, 0.2]]))
+
+
+def test_staying_is_a_cross_around_the_centre_of_its_cell(summary, grid_map):
+    of_rank = {m.id: m for m in assignment_markers(summary, grid_map, STAMP).markers[1:]}
+    ends = np.array([(point.x, point.y) for point in of_rank[2].points])
+    assert len(ends) == 4
+    assert ends.mean(axis=0) == pytest.approx(grid_map.centres_of([[0, 0]])[0])
+    assert grid_map.cells_of(ends).tolist() == [[0, 0]] * 4
+    first, second = ends[1] - ends[0], ends[3] - ends[2]
+    assert first @ second == pytest.approx(0.0)
+    assert np.linalg.norm(first) > 0
+
+
+def test_waypoints_are_the_subgoals_in_the_order_visited(summary, grid_map):
+    path = waypoint_path(summary, grid_map, STAMP)
+    assert path.header.frame_id == "odom"
+    assert path.header.stamp.sec == 12
+    position_of = {subgoal.rank: subgoal.position for subgoal in summary.subgoals}
+    places = [(pose.pose.position.x, pose.pose.position.y) for pose in path.poses]
+    assert places == [pytest.approx(position_of[rank]) for rank in (2, 1, 3)]
+    yaws = [yaw_in(pose.pose) for pose in path.poses]
+    assert yaws == pytest.approx([YAW + math.atan2(2, 4), 0.0, 0.0])
+    assert all(pose.header == path.header for pose in path.poses)
+
+
+def test_belief_is_the_probability_in_percent(summary, grid_map):
+    grid = belief_grid(summary, grid_map, STAMP)
+    assert grid.data.dtype == np.int8
+    assert grid.data.reshape(3, 5).tolist() == [
+        [99, 0, 0, 0, 50],
+        [0, 0, 0, 0, 0],
+        [0, 0, 0, 0, 100],
+    ]
+    assert (grid.info.width, grid.info.height, grid.info.resolution) == (5, 3, 0.5)
+    assert (grid.info.origin.position.x, grid.info.origin.position.y) == (10.0, 20.0)
+    assert yaw_in(grid.info.origin) == pytest.approx(YAW)
+
+
+def test_belief_over_another_map_is_refused(summary):
+    with pytest.raises(ValueError, match="belief over"):
+        belief_grid(summary, GridMap(np.ones((5, 3), dtype=bool)), STAMP)
+
+
+def test_the_map_message_means_the_map(grid_map):
+    message = map_message(grid_map, STAMP)
+    origin = message.info.origin
+    again = map_from_occupancy(
+        message.data,
+        message.info.width,
+        message.info.height,
+        message.info.resolution,
+        (origin.position.x, origin.position.y, yaw_in(origin)),
+        message.header.frame_id,
+        "map",
+    )
+    assert np.array_equal(again.free, grid_map.free)
+    assert again.origin == pytest.approx(grid_map.origin)
+    assert (again.resolution, again.frame_id) == (0.5, "odom")
+
+
+def test_a_pose_is_the_centre_of_its_cell(grid_map):
+    message = pose_message(grid_map, (3, 1), STAMP)
+    place = (message.pose.position.x, message.pose.position.y)
+    assert place == pytest.approx((10.0 - 0.75, 20.0 + 1.75))
+    assert grid_map.cells_of([place]).tolist() == [[3, 1]]
+    assert (message.header.frame_id, message.header.stamp.nanosec) == ("odom", 345_678_901)
+
+
+@pytest.mark.parametrize(
+    ("action", "step"), [(STAY, (0, 0)), (EAST, (1, 0)), (NORTH_EAST, (1, 1)), (6, (-1, -1))]
+)
+def test_an_action_is_its_step_in_map_axes(action, step):
+    message = action_message(action, STAMP, "odom")
+    assert (message.vector.x, message.vector.y, message.vector.z) == (*step, 0.0)
+    assert all(isinstance(number, float) for number in (message.vector.x, message.vector.y))
+    assert (message.header.frame_id, message.header.stamp.sec) == ("odom", 12)
+
+
+def test_the_table_says_what_the_summary_says(summary):
+    assert subgoal_table(summary).splitlines() == [
+        "rank    cell      place [m]  probability  observations  order",
+        "   1  (4, 2)  (8.75, 22.25)         1.00             3      2",
+        "   2  (0, 0)  (9.75, 20.25)         0.99             1      1",
+        "   3  (4, 0)  (9.75, 22.25)         0.50             1      3",
+    ]
+
+
+# Matrices on linear RGB of Machado, Oliveira & Fernandes (2009), severity 1.
+VISION = {
+    "normal": np.eye(3),
+    "protanopia": np.array(
+        [
+            [0.152286, 1.052583, -0.204868],
+            [0.114503, 0.786281, 0.099216],
+            [-0.003882, -0.048116, 1.051998],
+        ]
+    ),
+    "deuteranopia": np.array(
+        [
+            [0.367322, 0.860646, -0.227968],
+            [0.280085, 0.672501, 0.047413],
+            [-0.011820, 0.042940, 0.968881],
+        ]
+    ),
+}
+
+
+def perceived(colours: list[tuple[float, float, float]], vision: str) -> np.ndarray:
+    """OKLab coordinates (Ottosson 2020) of sRGB colours as a kind of vision sees them."""
+    srgb = np.array(colours)
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    seen = np.clip(linear @ VISION[vision].T, 0, 1)
+    cones = np.cbrt(
+        seen
+        @ np.array(
+            [
+                [0.4122214708, 0.2119034982, 0.0883024619],
+                [0.5363325363, 0.6806995451, 0.2817188376],
+                [0.0514459929, 0.1073969566, 0.6299787005],
+            ]
+        )
+    )
+    return cones @ np.array(
+        [
+            [0.2104542553, 1.9779984951, 0.0259040371],
+            [0.7936177850, -2.4285922050, 0.7827717662],
+            [-0.0040720468, 0.4505937099, -0.8086757660],
+        ]
+    )
+
+
+@pytest.mark.parametrize("vision", VISION)
+def test_twelve_ranks_and_the_unexplained_can_be_told_apart(vision):
+    # About 0.02 in OKLab is just noticeable side by side; the first six, the usual case, keep
+    # far more.
+    lab = perceived([*(colour_of(rank) for rank in range(1, 13)), UNEXPLAINED], vision)
+    apart = np.linalg.norm(lab[:, np.newaxis] - lab, axis=2)
+    others = apart[~np.eye(len(lab), dtype=bool)]
+    assert others.min() > 0.06
+    six = apart[:6, :6][~np.eye(6, dtype=bool)]
+    assert six.min() > 0.1
+
+
+def test_the_colours_after_the_palette_are_its_variations_and_stay_in_range():
+    colours = [colour_of(rank) for rank in range(1, 37)]
+    assert len(set(colours)) == 36
+    assert colour_of(37) == colour_of(1)
+    assert all(0 <= part <= 1 for colour in colours for part in colour)
+
+
+def colours_in(path: object) -> set[tuple[int, int, int]]:
+    pixels = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3)
+    return {(int(r), int(g), int(b)) for r, g, b in np.unique(pixels, axis=0)}
+
+
+def as_bytes(colour: tuple[float, float, float]) -> tuple[int, int, int]:
+    red, green, blue = (round(255 * part) for part in colour)
+    return red, green, blue
+
+
+def test_the_picture_holds_every_subgoal_in_its_colour(tmp_path, summary, grid_map):
+    path = tmp_path / "subgoals.png"
+    draw_summary(summary, grid_map, path, title="A title")
+    found = colours_in(path)
+    assert all(as_bytes(colour_of(rank)) in found for rank in (1, 2, 3))
+    assert as_bytes(colour_of(4)) not in found
+    assert as_bytes(UNEXPLAINED) not in found
+
+
+def test_the_picture_shows_unexplained_observations_in_grey(tmp_path, summary, grid_map):
+    slip = dataclasses.replace(summary, rank_of=np.array([1, 1, -1, 2, 3]))
+    draw_summary(slip, grid_map, tmp_path / "subgoals.png")
+    assert as_bytes(UNEXPLAINED) in colours_in(tmp_path / "subgoals.png")
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 200), (200, 1), (300, 600)])
+def test_the_picture_suits_any_map(tmp_path, summary, shape):
+    rows, columns = shape
+    grid_map = GridMap(np.ones(shape, dtype=bool))
+    subgoals = tuple(
+        dataclasses.replace(each, cell=(each.rank % columns, each.rank % rows))
+        for each in summary.subgoals
+    )
+    observations = summary.observations % (10, columns, rows, 9)
+    draw_summary(
+        dataclasses.replace(summary, subgoals=subgoals, observations=observations),
+        grid_map,
+        tmp_path / "subgoals.png",
+    )
+    width, height = Image.open(tmp_path / "subgoals.png").size
+    assert 600 < width < 1800
+    assert 200 < height < 1800
+
+
+def test_the_picture_without_a_subgoal_or_an_observation(tmp_path, summary, grid_map):
+    nothing = dataclasses.replace(
+        summary,
+        subgoals=(),
+        visit_sequence=(),
+        observations=np.zeros((0, 4), dtype=np.int64),
+        rank_of=np.zeros(0, dtype=np.int64),
+    )
+    draw_summary(nothing, grid_map, tmp_path / "subgoals.png")
+    assert as_bytes(colour_of(2)) not in colours_in(tmp_path / "subgoals.png")
+
+
+def test_the_same_summary_gives_the_same_picture(tmp_path, summary, grid_map):
+    for name in ("a.png", "b.png"):
+        draw_summary(summary, grid_map, tmp_path / name)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_views_load_no_plotting_until_a_picture_is_drawn():
+    program = (
+        "import json, sys, bnirl_ros.views.plot, bnirl_ros.views.markers, bnirl_ros.maps;"
+        "slow = ('matplotlib', 'PIL', 'yaml', 'rclpy');"
+        "print(json.dumps([name for name in slow if name in sys.modules]))"
+    )
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True)
+    assert json.loads(ran.stdout) == []
