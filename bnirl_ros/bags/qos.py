@@ -1,0 +1,101 @@
+"""Quality of service as bags record it, in the YAML of every rosbag2 version."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+_HISTORIES = ("system_default", "keep_last", "keep_all", "unknown")
+_RELIABILITIES = ("system_default", "reliable", "best_effort", "unknown", "best_available")
+_DURABILITIES = ("system_default", "transient_local", "volatile", "unknown", "best_available")
+
+
+@dataclass(frozen=True)
+class QosProfile:
+    """What a publisher offers, in rosbag2's words.
+
+    Attributes:
+        reliability: reliable or best_effort.
+        durability: volatile or transient_local.
+        history: keep_last or keep_all.
+        depth: number of messages kept, with keep_last.
+
+    Bags also know `system_default`, `unknown` and `best_available` for the first three.
+    """
+
+    reliability: str = "reliable"
+    durability: str = "volatile"
+    history: str = "keep_last"
+    depth: int = 10
+
+
+RELIABLE = QosProfile(depth=40_000)
+"""Loses nothing: deep enough for the bursts of a replay (see the topics' contract)."""
+
+LATCHED = QosProfile(durability="transient_local", depth=1)
+"""The last message is kept for subscribers that come later."""
+
+
+def qos_to_yaml(profiles: Iterable[QosProfile]) -> str:
+    """The YAML list that rosbag2 writes since its metadata version 9."""
+    return "\n".join(_profile_to_yaml(profile) for profile in profiles)
+
+
+def _profile_to_yaml(profile: QosProfile) -> str:
+    # rosbag2's infinity is the largest number of nanoseconds in 64 bits.
+    for_ever = "\n    sec: 9223372036\n    nsec: 854775807"
+    return (
+        f"- history: {profile.history}\n"
+        f"  depth: {profile.depth}\n"
+        f"  reliability: {profile.reliability}\n"
+        f"  durability: {profile.durability}\n"
+        f"  deadline:{for_ever}\n"
+        f"  lifespan:{for_ever}\n"
+        "  liveliness: automatic\n"
+        f"  liveliness_lease_duration:{for_ever}\n"
+        "  avoid_ros_namespace_conventions: false"
+    )
+
+
+@lru_cache(maxsize=256)
+def qos_from_yaml(text: str) -> tuple[QosProfile, ...]:
+    """The profiles in a bag's YAML; policies are names or, up to metadata version 8, numbers.
+
+    What is no list of profiles, as the empty text of early versions, gives no profiles: a bag's
+    messages are worth more than its quality of service.
+    """
+    if not text.strip():
+        return ()
+    profiles = parse_yaml(text)
+    if not isinstance(profiles, list):
+        return ()
+    return tuple(_profile(each) for each in profiles if isinstance(each, dict))
+
+
+def parse_yaml(text: str) -> Any:
+    """The value of a YAML text, or None where it is no YAML."""
+    import yaml  # slow to import, and not every bag has any
+
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    try:
+        return yaml.load(text, Loader=loader)
+    except (yaml.YAMLError, ValueError, RecursionError):
+        return None
+
+
+def _profile(values: dict[str, Any]) -> QosProfile:
+    depth = values.get("depth")
+    return QosProfile(
+        reliability=_policy(values.get("reliability"), _RELIABILITIES),
+        durability=_policy(values.get("durability"), _DURABILITIES),
+        history=_policy(values.get("history"), _HISTORIES),
+        depth=depth if isinstance(depth, int) else 0,
+    )
+
+
+def _policy(value: object, names: tuple[str, ...]) -> str:
+    if isinstance(value, int) and 0 <= value < len(names):
+        return names[value]
+    return value if isinstance(value, str) and value in names else "unknown"

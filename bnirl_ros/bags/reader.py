@@ -1,0 +1,442 @@
+"""Reading bags: rosbag2 folders and MCAP files, whole or damaged, in the order of log time."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, NamedTuple
+
+from bnirl_ros.bags.definitions import full_type_name
+from bnirl_ros.bags.qos import QosProfile, parse_yaml, qos_from_yaml
+from bnirl_ros.bags.records import (
+    CHUNK_HEAD,
+    FRAME,
+    MAGIC,
+    MESSAGE_HEAD,
+    Channel,
+    Contents,
+    DamageError,
+    Opcode,
+    Schema,
+    Statistics,
+    check_frame,
+    contents_of,
+    contents_of_chunk,
+    message_time,
+    parse_channel,
+    parse_schema,
+    parse_statistics,
+)
+from bnirl_ros.errors import InputError
+
+_RUN_SIZE = 2**20  # bytes of messages outside chunks that are read at once
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_SQLITE_MAGIC = b"SQLite format 3\0"
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a bag.
+
+    Attributes:
+        name: as recorded.
+        type_name: `package/msg/Type`; empty where the bag doesn't say.
+        messages: how many, as far as the bag says or could be read.
+        qos: what its publishers offered; empty where the bag doesn't say.
+        encoding: of its messages' bytes; only `cdr` can be decoded.
+        type_hash: `RIHS01_...`; empty where the bag doesn't say.
+    """
+
+    name: str
+    type_name: str
+    messages: int
+    qos: tuple[QosProfile, ...] = ()
+    encoding: str = "cdr"
+    type_hash: str = ""
+
+
+class RawMessage(NamedTuple):
+    """A message as recorded: `data` is still encoded; `log_time` is when it was received [ns]."""
+
+    topic: str
+    type_name: str
+    log_time: int
+    data: bytes
+
+
+class Bag:
+    """A recorded bag, opened to be read.
+
+    Nothing in the bag can raise anything but `InputError` here, and that only where nothing at
+    all can be read. Of a damaged bag everything is read that can be; `damage` says what was not.
+
+    Args:
+        path: a rosbag2 folder, or an `.mcap` file.
+
+    Attributes:
+        path: as given.
+        warnings: sentences on what is wrong with the bag but loses nothing.
+
+    Raises:
+        InputError: the path doesn't exist, a folder has no `.mcap` file, or no file is MCAP.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.warnings: list[str] = []
+        self._files: list[_File] = []
+        self._unread: list[str] = []
+        try:
+            found = self._find_files()
+        except OSError as fault:
+            raise _unreadable(self.path, fault) from fault
+        for file in found:
+            try:
+                self._files.append(_File(file))
+            except InputError as refusal:
+                self._unread.append(str(refusal))
+        if not self._files:
+            raise InputError(self._unread[0])
+
+    @property
+    def files(self) -> list[Path]:
+        """The MCAP files that are read."""
+        return [file.path for file in self._files]
+
+    @property
+    def damage(self) -> str | None:
+        """What is damaged, a sentence for each file: the byte, and how many messages were read.
+
+        None for a sound bag. Damage inside a chunk is found only when its messages are read, so
+        ask again after reading.
+        """
+        damages = [file.damage for file in self._files if file.damage is not None]
+        return " ".join(self._unread + damages) or None
+
+    def topics(self) -> list[Topic]:
+        """The topics by name, those without messages among them."""
+        found: dict[tuple[str, str, str], Topic] = {}
+        for file in self._files:
+            for channel in file.channels.values():
+                known = found.get((channel.topic, file.type_of(channel), channel.encoding))
+                topic = file.topic(channel)
+                if known is not None:
+                    topic = Topic(
+                        name=topic.name,
+                        type_name=topic.type_name,
+                        messages=known.messages + topic.messages,
+                        qos=known.qos + tuple(new for new in topic.qos if new not in known.qos),
+                        encoding=topic.encoding,
+                        type_hash=known.type_hash or topic.type_hash,
+                    )
+                found[topic.name, topic.type_name, topic.encoding] = topic
+        return [found[key] for key in sorted(found)]
+
+    def messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
+        """The messages in the order of log time, across chunks and files.
+
+        Messages of one time come in the order in which they lie in the bag. Memory holds only
+        those chunks whose times overlap.
+
+        Args:
+            topics: names of the wanted ones; all when None.
+        """
+        wanted = None if topics is None else frozenset(topics)
+        # What lies in the bag's pieces is merged; a piece is read only when its time comes.
+        waiting = sorted(
+            (piece.start, file_number, piece_number)
+            for file_number, file in enumerate(self._files)
+            for piece_number, piece in enumerate(file.pieces)
+        )
+        for file in self._files:
+            file.messages_read = 0
+        merging: list[tuple[int, int, int, int, list[RawMessage]]] = []
+        for start, file_number, piece_number in waiting:
+            yield from _merged(merging, until=start)
+            file = self._files[file_number]
+            messages = file.messages_of(file.pieces[piece_number], wanted)
+            if messages:
+                first = (messages[0].log_time, file_number, piece_number, 0, messages)
+                heapq.heappush(merging, first)
+        yield from _merged(merging, until=None)
+
+    def _find_files(self) -> list[Path]:
+        path = self.path
+        if path.is_file():
+            return [path]
+        if not path.is_dir():
+            raise InputError(
+                f"{path} does not exist: name a rosbag2 folder or an .mcap file that does."
+            )
+        here = sorted(path.glob("*.mcap"))
+        listed, warning = _listed_files(path)
+        if warning is None:
+            return listed
+        if not here:
+            raise InputError(
+                f"The folder {path} holds no .mcap file: name a bag recorded with `-s mcap`, or "
+                "convert one with `ros2 bag convert`."
+            )
+        self.warnings.append(f"{warning}: its .mcap files are read in the order of their names.")
+        return here
+
+
+def _listed_files(folder: Path) -> tuple[list[Path], str | None]:
+    """The files that metadata.yaml names, and a complaint where it cannot be followed."""
+    metadata = folder / "metadata.yaml"
+    try:
+        values = parse_yaml(metadata.read_text(encoding="utf-8"))
+        names = values["rosbag2_bagfile_information"]["relative_file_paths"]
+        listed = [folder / str(name) for name in names]
+        # Early versions wrote the folder's name before that of the file.
+        listed = [file if file.exists() else folder / file.name for file in listed]
+        missing = [file.name for file in listed if not file.is_file()]
+    except (OSError, ValueError):
+        return [], f"{folder} has no metadata.yaml that can be read"
+    except (TypeError, KeyError):
+        return [], f"{metadata} does not say which files belong to the bag"
+    if missing:
+        return [], f"{metadata} names {', '.join(missing)}, which is not there"
+    if not listed:
+        return [], f"{metadata} names no files"
+    return listed, None
+
+
+def _merged(
+    merging: list[tuple[int, int, int, int, list[RawMessage]]], until: int | None
+) -> Iterator[RawMessage]:
+    """Take messages from a heap of sorted lists, up to a time; None takes all.
+
+    An entry is the time of the list's next message, two numbers that order equal times, the place
+    of that message in the list, and the list.
+    """
+    while merging and (until is None or merging[0][0] < until):
+        _, file_number, piece_number, place, messages = merging[0]
+        yield messages[place]
+        place += 1
+        if place == len(messages):
+            heapq.heappop(merging)
+        else:
+            after = (messages[place].log_time, file_number, piece_number, place, messages)
+            heapq.heapreplace(merging, after)
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """A stretch of a file that holds messages: a chunk, or a run of records outside chunks.
+
+    `offset` and `length` [bytes] cover whole records; `start` is the earliest log time [ns].
+    """
+
+    offset: int
+    length: int
+    start: int
+    is_chunk: bool
+
+
+@dataclass
+class _File:
+    """One MCAP file: what it defines, and where its messages lie.
+
+    Raises:
+        InputError: it cannot be opened, or is no MCAP file.
+    """
+
+    path: Path
+    pieces: list[_Piece] = field(default_factory=list)
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+    faults: dict[int, str] = field(default_factory=dict)
+    messages_read: int = 0
+
+    def __post_init__(self) -> None:
+        try:
+            with self.path.open("rb") as stream:
+                _check_magic(self.path, stream.read(len(_SQLITE_MAGIC)))
+                statistics = self._scan(stream)
+        except OSError as fault:
+            raise _unreadable(self.path, fault) from fault
+        if statistics is not None and self._defines_all(statistics):
+            self.counts = statistics.messages
+        else:
+            # No summary, or one that leaves things out: only the chunks themselves know them.
+            self._read_definitions()
+
+    @property
+    def damage(self) -> str | None:
+        if not self.faults:
+            return None
+        offset, reason = min(self.faults.items())
+        more = f" (and in {len(self.faults) - 1} more places)" if len(self.faults) > 1 else ""
+        return (
+            f"{self.path} is damaged at byte {offset}{more}: {reason}; {self.messages_read} "
+            "messages could be read."
+        )
+
+    def type_of(self, channel: Channel) -> str:
+        schema = self.schemas.get(channel.schema_id)
+        return full_type_name(schema.name) if schema else ""
+
+    def topic(self, channel: Channel) -> Topic:
+        return Topic(
+            name=channel.topic,
+            type_name=self.type_of(channel),
+            messages=self.counts.get(channel.id, 0),
+            qos=qos_from_yaml(channel.metadata.get("offered_qos_profiles", "")),
+            encoding=channel.encoding,
+            type_hash=channel.metadata.get("topic_type_hash", ""),
+        )
+
+    def messages_of(self, piece: _Piece, wanted: frozenset[str] | None) -> list[RawMessage]:
+        """The wanted messages of a piece in the order of log time."""
+        contents = self._contents_of(piece)
+        self.messages_read += len(contents.messages)
+        kinds = {
+            channel.id: (channel.topic, self.type_of(channel))
+            for channel in self.channels.values()
+            if wanted is None or channel.topic in wanted
+        }
+        unknown = {message.channel_id for message in contents.messages} - self.channels.keys()
+        if unknown:
+            self.faults.setdefault(piece.offset, "messages belong to a topic that is not defined")
+        messages = [
+            RawMessage(*kinds[message.channel_id], message.log_time, message.data)
+            for message in contents.messages
+            if message.channel_id in kinds
+        ]
+        messages.sort(key=lambda message: message.log_time)
+        return messages
+
+    def _contents_of(self, piece: _Piece) -> Contents:
+        try:
+            with self.path.open("rb") as stream:
+                stream.seek(piece.offset)
+                data = stream.read(piece.length)
+        except OSError as fault:
+            contents = Contents(damage=f"it cannot be read ({fault.strerror})")
+        else:
+            contents = (
+                contents_of_chunk(data[FRAME.size :]) if piece.is_chunk else contents_of(data)
+            )
+        if contents.damage is not None:
+            self.faults.setdefault(piece.offset, contents.damage)
+        return contents
+
+    def _defines_all(self, statistics: Statistics) -> bool:
+        used = {channel.schema_id for channel in self.channels.values()} - {0}
+        return len(self.channels) >= statistics.channels and used <= self.schemas.keys()
+
+    def _read_definitions(self) -> None:
+        self.counts = {}
+        for piece in self.pieces:
+            contents = self._contents_of(piece)
+            self.schemas |= contents.schemas
+            self.channels |= contents.channels
+            self.messages_read += len(contents.messages)
+            for message in contents.messages:
+                self.counts[message.channel_id] = self.counts.get(message.channel_id, 0) + 1
+
+    def _scan(self, stream: IO[bytes]) -> Statistics | None:
+        """Walk the file's records without reading the chunks; also the summary is records."""
+        size = stream.seek(0, 2)
+        offset = len(MAGIC)
+        run = _Run(self.pieces)
+        statistics = None
+        opcode = 0
+        while opcode != Opcode.FOOTER:
+            try:
+                opcode, end = self._frame_at(stream, offset, size)
+            except DamageError as damage:
+                self.faults[offset] = str(damage)
+                break
+            try:
+                if opcode == Opcode.MESSAGE:
+                    run.add(offset, end, message_time(stream.read(MESSAGE_HEAD.size)))
+                elif opcode == Opcode.STATISTICS:
+                    statistics = parse_statistics(_content(stream, offset, end))
+                elif opcode == Opcode.SCHEMA:
+                    schema = parse_schema(_content(stream, offset, end))
+                    self.schemas[schema.id] = schema
+                elif opcode == Opcode.CHANNEL:
+                    channel = parse_channel(_content(stream, offset, end))
+                    self.channels[channel.id] = channel
+                elif opcode == Opcode.FOOTER:
+                    _check_end(stream, end)
+            except DamageError as damage:
+                # The frame is whole, so the records after this one can still be read.
+                self.faults[offset] = str(damage)
+            offset = end
+        run.end()
+        return None if self.faults else statistics
+
+    def _frame_at(self, stream: IO[bytes], offset: int, size: int) -> tuple[int, int]:
+        """Opcode and end of the record at the offset; a chunk is noted also if it breaks off."""
+        stream.seek(offset)
+        frame = stream.read(FRAME.size)
+        if len(frame) < FRAME.size:
+            raise DamageError("the file breaks off there, as when a recording was interrupted")
+        opcode, length = FRAME.unpack(frame)
+        body = offset + FRAME.size
+        if opcode == Opcode.CHUNK:
+            head = stream.read(CHUNK_HEAD.size)
+            if len(head) == CHUNK_HEAD.size:
+                end = min(body + length, size)
+                start = CHUNK_HEAD.unpack(head)[0]
+                self.pieces.append(_Piece(offset, end - offset, start, is_chunk=True))
+        check_frame(opcode, length, size - body)
+        return opcode, body + length
+
+
+def _check_magic(path: Path, beginning: bytes) -> None:
+    if beginning.startswith(MAGIC):
+        return
+    if not beginning:
+        problem = "is empty: record it again"
+    elif beginning.startswith(_ZSTD_MAGIC):
+        problem = "is compressed as a whole: unpack it with `zstd -d`"
+    elif beginning.startswith(_SQLITE_MAGIC):
+        problem = "is an SQLite bag: convert it with `ros2 bag convert`"
+    else:
+        problem = "is no MCAP file: name a rosbag2 folder or an .mcap file"
+    raise InputError(f"{path} {problem}.")
+
+
+def _unreadable(path: Path, fault: OSError) -> InputError:
+    return InputError(
+        f"{path} cannot be read ({fault.strerror}): check that it is a file or folder that you may "
+        "read."
+    )
+
+
+def _content(stream: IO[bytes], offset: int, end: int) -> bytes:
+    stream.seek(offset + FRAME.size)
+    return stream.read(end - offset - FRAME.size)
+
+
+def _check_end(stream: IO[bytes], offset: int) -> None:
+    stream.seek(offset)
+    if stream.read(len(MAGIC)) != MAGIC:
+        raise DamageError("the file does not end as MCAP files do")
+
+
+class _Run:
+    """Gathers messages outside chunks into pieces of a size that is good to read at once."""
+
+    def __init__(self, pieces: list[_Piece]) -> None:
+        self._pieces = pieces
+        self._offset = self._end = self._start = 0
+
+    def add(self, offset: int, end: int, time: int) -> None:
+        if offset != self._end or end - self._offset > _RUN_SIZE:
+            self.end()
+            self._offset, self._start = offset, time
+        self._end, self._start = end, min(self._start, time)
+
+    def end(self) -> None:
+        if self._end:
+            length = self._end - self._offset
+            self._pieces.append(_Piece(self._offset, length, self._start, is_chunk=False))
+        self._offset = self._end = 0

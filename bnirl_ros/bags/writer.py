@@ -1,0 +1,237 @@
+"""Writing bags: the folder, file and metadata that `ros2 bag record -s mcap` would leave."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO, TYPE_CHECKING
+
+from bnirl_ros import __version__
+from bnirl_ros.bags.cdr import Message, encode
+from bnirl_ros.bags.definitions import full_type_name, message_definition, type_hash
+from bnirl_ros.bags.qos import QosProfile, qos_to_yaml
+from bnirl_ros.errors import InputError
+
+if TYPE_CHECKING:
+    from mcap.writer import Writer
+
+CHUNK_SIZE = 1024 * 1024
+"""Bytes of messages in a chunk before compression: larger ones hardly compress better, and all
+but the last are safe when the writing process is killed."""
+
+_NEVER = 2**63 - 1  # rosbag2's starting time of a bag without messages [ns]
+_TOPIC_NAME = re.compile(r"~?/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*")
+_PLAIN_YAML = re.compile(r"[A-Za-z_][\w.-]*")
+
+
+@dataclass
+class _Channel:
+    """A topic in the making: what its metadata say, and its number in the MCAP file."""
+
+    name: str
+    type_name: str
+    qos: QosProfile
+    id: int
+    messages: int = 0
+
+
+class BagWriter:
+    """Writes one rosbag2 folder, `<name>/<name>_0.mcap` and `<name>/metadata.yaml`.
+
+    To be used in a `with` statement. The bag appears when the block ends well; when an exception
+    leaves it, nothing that looks like a bag is left behind. The same calls give the same bytes.
+
+    Args:
+        folder: the bag, whose last part is its name.
+        overwrite: whether a bag that is there already may be replaced; other files in the folder
+            stay.
+
+    Raises:
+        InputError: the folder is there and not empty, or cannot be written to.
+    """
+
+    def __init__(self, folder: str | Path, *, overwrite: bool = False) -> None:
+        self._folder = Path(folder)
+        self._file_name = f"{self._folder.resolve().name}_0.mcap"
+        self._partial = self._folder / f"{self._file_name}.partial"
+        self._overwrite = overwrite
+        self._channels: dict[str, _Channel] = {}
+        self._schema_ids: dict[str, int] = {}
+        self._start: int | None = None
+        self._end = 0
+        self._stream: IO[bytes] | None = None
+        self._writer: Writer | None = None
+
+    def __enter__(self) -> BagWriter:
+        """Make the folder and begin the file, under a name that no reader takes for a bag."""
+        from mcap.writer import Writer  # only those who write pay for it
+
+        try:
+            if not self._overwrite and self._folder.exists() and any(self._folder.iterdir()):
+                raise InputError(
+                    f"{self._folder} exists already: choose another name, or allow it to be "
+                    "overwritten."
+                )
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._stream = self._partial.open("wb")
+        except OSError as fault:
+            raise InputError(
+                f"The bag {self._folder} cannot be written: {fault.strerror}; choose a folder "
+                "that can."
+            ) from fault
+        self._writer = Writer(self._stream, chunk_size=CHUNK_SIZE)
+        self._writer.start(profile="ros2", library=f"bnirl_ros {__version__}")
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        exception: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Finish the bag and let it appear, or remove what was written of it."""
+        assert self._stream is not None
+        try:
+            if kind is None:
+                self._finish()
+        finally:
+            self._stream.close()
+            self._partial.unlink(missing_ok=True)
+            self._writer = None
+            if self._folder.is_dir() and not any(self._folder.iterdir()):
+                self._folder.rmdir()
+
+    def add_topic(self, name: str, type_name: str, qos: QosProfile) -> None:
+        """Announce a topic; also one without messages then is in the bag.
+
+        Raises:
+            InputError: the message type is unknown.
+            ValueError: the name is no topic name, or the topic is there already.
+        """
+        if not _TOPIC_NAME.fullmatch(name):
+            raise ValueError(f"{name!r} is no name for a topic.")
+        if name in self._channels:
+            raise ValueError(f"The topic {name} is in the bag already.")
+        writer = self._open_writer()
+        type_name = full_type_name(type_name)
+        definition = message_definition(type_name)
+        if type_name not in self._schema_ids:
+            self._schema_ids[type_name] = writer.register_schema(
+                name=type_name, encoding="ros2msg", data=definition.encode()
+            )
+        channel = writer.register_channel(
+            topic=name,
+            message_encoding="cdr",
+            schema_id=self._schema_ids[type_name],
+            metadata={
+                "offered_qos_profiles": qos_to_yaml([qos]),
+                "topic_type_hash": type_hash(type_name),
+            },
+        )
+        self._channels[name] = _Channel(name, type_name, qos, channel)
+
+    def write(self, topic: str, message: Message, log_time_ns: int) -> None:
+        """Add a message.
+
+        Args:
+            topic: one that was announced.
+            message: of the topic's type.
+            log_time_ns: when it was received; also written as when it was published [ns].
+
+        Raises:
+            ValueError: the topic was not announced, the message is of another type or cannot be
+                encoded, or the time lies outside 0 to 2^63 - 1.
+        """
+        channel = self._channels.get(topic)
+        if channel is None:
+            raise ValueError(f"The topic {topic} was not added to the bag.")
+        if channel.type_name != message.TYPE:
+            raise ValueError(f"The topic {topic} carries {channel.type_name}, no {message.TYPE}.")
+        if not 0 <= log_time_ns <= _NEVER:
+            raise ValueError(f"{log_time_ns} ns is no time that a bag can hold.")
+        self._open_writer().add_message(
+            channel_id=channel.id,
+            log_time=log_time_ns,
+            publish_time=log_time_ns,
+            data=encode(message),
+        )
+        channel.messages += 1
+        self._start = log_time_ns if self._start is None else min(self._start, log_time_ns)
+        self._end = max(self._end, log_time_ns)
+
+    def _open_writer(self) -> Writer:
+        if self._writer is None:
+            raise ValueError("A BagWriter writes only inside its with statement.")
+        return self._writer
+
+    def _finish(self) -> None:
+        writer = self._open_writer()
+        assert self._stream is not None
+        metadata = self._metadata()
+        writer.flush()  # type: ignore[no-untyped-call]
+        writer.add_metadata("rosbag2", {"serialized_metadata": metadata})
+        writer.finish()  # type: ignore[no-untyped-call]
+        self._stream.close()
+        # metadata.yaml makes the folder a bag: it goes first and comes last.
+        yaml_file = self._folder / "metadata.yaml"
+        yaml_file.unlink(missing_ok=True)
+        self._partial.replace(self._folder / self._file_name)
+        stem = re.escape(self._file_name.removesuffix("_0.mcap"))
+        for split in self._folder.glob("*.mcap"):
+            if re.fullmatch(rf"{stem}_[1-9]\d*\.mcap", split.name):
+                split.unlink()
+        indented = "".join(f"  {line}\n" for line in metadata.splitlines())
+        yaml_file.write_text(f"rosbag2_bagfile_information:\n{indented}", encoding="utf-8")
+
+    def _metadata(self) -> str:
+        """Version 9 of rosbag2's metadata, in the order in which rosbag2 writes it."""
+        start = _NEVER if self._start is None else self._start
+        duration = 0 if self._start is None else self._end - self._start
+        messages = sum(channel.messages for channel in self._channels.values())
+        file_name = _quoted(self._file_name)
+        topics = "\n".join(_topic_metadata(channel) for channel in self._channels.values())
+        return f"""\
+version: 9
+storage_identifier: mcap
+duration:
+  nanoseconds: {duration}
+starting_time:
+  nanoseconds_since_epoch: {start}
+message_count: {messages}
+topics_with_message_count:
+{topics or "  []"}
+compression_format: ""
+compression_mode: ""
+relative_file_paths:
+  - {file_name}
+files:
+  - path: {file_name}
+    starting_time:
+      nanoseconds_since_epoch: {start}
+    duration:
+      nanoseconds: {duration}
+    message_count: {messages}
+custom_data: ~
+ros_distro: jazzy"""
+
+
+def _topic_metadata(channel: _Channel) -> str:
+    qos = "\n".join(f"        {line}" for line in qos_to_yaml([channel.qos]).splitlines())
+    return f"""\
+  - topic_metadata:
+      name: {channel.name}
+      type: {channel.type_name}
+      serialization_format: cdr
+      offered_qos_profiles:
+{qos}
+      type_description_hash: {type_hash(channel.type_name)}
+    message_count: {channel.messages}"""
+
+
+def _quoted(text: str) -> str:
+    """A string as YAML takes it for a string: JSON's quotes are YAML's, too."""
+    import json
+
+    return text if _PLAIN_YAML.fullmatch(text) else json.dumps(text)
