@@ -8,6 +8,7 @@ import math
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -334,9 +335,10 @@ def test_the_colours_after_the_palette_are_its_variations_and_stay_in_range():
     assert all(0 <= part <= 1 for colour in colours for part in colour)
 
 
-def colours_in(path: object) -> set[tuple[int, int, int]]:
-    pixels = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3)
-    return {(int(r), int(g), int(b)) for r, g, b in np.unique(pixels, axis=0)}
+def colours_in(path: Path) -> set[tuple[int, int, int]]:
+    with Image.open(path) as image:
+        counted = image.convert("RGB").getcolors(maxcolors=image.width * image.height)
+    return {colour for _, colour in counted}
 
 
 def as_bytes(colour: tuple[float, float, float]) -> tuple[int, int, int]:

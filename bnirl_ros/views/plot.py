@@ -21,10 +21,10 @@ from bnirl_ros.views.waypoints import subgoals_in_order
 _DOTS_PER_INCH = 144
 _POINTS_PER_INCH = 72
 _LONGEST = 7.4  # Longer side of the axes [inch].
+_LARGEST_CELL = 0.85  # Edge of a cell, so that tiny maps are drawn small [inch].
 _SHORTEST = 1.6  # Shorter side of the axes, unless the map would be stretched [inch].
 _LEFT, _BOTTOM = 0.65, 0.6  # Margins beside and below the axes [inch].
 _TOP, _TITLED_TOP = 0.2, 0.5  # Margin above them, without and with a title [inch].
-_BEND = 0.14  # How far the way from one subgoal to the next bows, as a share of its length.
 _LEGEND_WIDTH = 3.85  # Room right of the axes [inch].
 _LEGEND_LINE = 0.235  # Height of one line of the legend [inch].
 _LARGEST_LEGEND = 24  # Subgoals that the legend lists.
@@ -45,12 +45,16 @@ _ARROW = np.array(
 
 @dataclass(frozen=True)
 class _Layout:
-    """Sizes of the picture: figure, axes and top margin [inch], a cell's edge on paper [pt]."""
+    """Sizes of the picture: figure, axes and top margin [inch], a cell's edge on paper [pt].
+
+    `bend` is how far the way from one subgoal to the next bows, as a share of its length.
+    """
 
     figure: tuple[float, float]
     axes: tuple[float, float]
     top: float
     cell: float
+    bend: float
 
 
 def draw_summary(
@@ -113,21 +117,23 @@ def _layout(grid_map: GridMap, subgoals: int, top: float) -> _Layout:
     rows, columns = grid_map.free.shape
     # A longish map is as long as there is room, a square one smaller: about the same area.
     longest = _LONGEST * min(1.0, 0.78 * math.sqrt(max(rows, columns) / min(rows, columns)))
-    inches = longest / max(rows, columns)
+    inches = min(longest / max(rows, columns), _LARGEST_CELL)
     axes = (max(columns * inches, _SHORTEST), max(rows * inches, _SHORTEST))
     legend = _LEGEND_LINE * (min(subgoals, _LARGEST_LEGEND) + 5)
     figure = (
         _LEFT + axes[0] + _LEGEND_WIDTH,
         top + max(axes[1] + _BOTTOM, legend),
     )
-    return _Layout(figure, axes, top, inches * _POINTS_PER_INCH)
+    # Ways bow aside of what was walked, but along a corridor not out of the map.
+    bend = 0.14 * min(1.0, 2.5 * min(rows, columns) / max(rows, columns))
+    return _Layout(figure, axes, top, inches * _POINTS_PER_INCH, bend)
 
 
 def _draw_map(axes: Any, grid_map: GridMap, layout: _Layout) -> None:
     rows, columns = grid_map.free.shape
-    image = np.where(grid_map.free[..., np.newaxis], _FREE, _BLOCKED)
+    shades = np.rint(255 * np.array([_BLOCKED, _FREE])).astype(np.uint8)
     axes.imshow(
-        image,
+        shades[grid_map.free.astype(np.uint8)],
         origin="lower",
         extent=(-0.5, columns - 0.5, -0.5, rows - 0.5),
         interpolation="nearest" if layout.cell >= 2 else "antialiased",
@@ -138,8 +144,9 @@ def _draw_map(axes: Any, grid_map: GridMap, layout: _Layout) -> None:
         axes.hlines(np.arange(rows - 1) + 0.5, -0.5, columns - 0.5, colors=[_GRID], linewidth=0.6)
     from matplotlib.ticker import MaxNLocator
 
-    axes.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True, min_n_ticks=1))
-    axes.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True, min_n_ticks=1))
+    for axis, cells in ((axes.xaxis, columns), (axes.yaxis, rows)):
+        ticks = min(max(int(cells * layout.cell / 50), 1), 8)  # One in 50 points of paper.
+        axis.set_major_locator(MaxNLocator(nbins=ticks, integer=True, min_n_ticks=1))
     axes.tick_params(labelsize=8.5, length=3, color=_ROUTE, labelcolor=INK)
     axes.set_xlabel(f"x [cells of {grid_map.resolution:.4g} m]", fontsize=9, color=INK)
     axes.set_ylabel("y [cells]", fontsize=9, color=INK)
@@ -234,7 +241,7 @@ def _draw_route(axes: Any, summary: Summary, layout: _Layout) -> None:
             FancyArrowPatch(
                 here.cell,
                 there.cell,
-                connectionstyle=f"arc3,rad={_BEND}",
+                connectionstyle=f"arc3,rad={layout.bend}",
                 arrowstyle="-|>,head_length=5,head_width=2.6",
                 shrinkA=_marker(layout) / 2 + 1,
                 shrinkB=_marker(layout) / 2 + 2,
@@ -246,14 +253,14 @@ def _draw_route(axes: Any, summary: Summary, layout: _Layout) -> None:
                 zorder=4,
             )
         )
-        _write_order(axes, _middle_of_way(here, there), number)
+        _write_order(axes, _middle_of_way(here, there, layout), number)
 
 
-def _middle_of_way(here: Subgoal, there: Subgoal) -> npt.NDArray[np.float64]:
+def _middle_of_way(here: Subgoal, there: Subgoal, layout: _Layout) -> npt.NDArray[np.float64]:
     """The place (x, y) [cells] halfway along the bowed way between two subgoals."""
     start, end = np.array(here.cell), np.array(there.cell)
     right, up = end - start
-    return np.asarray((start + end + _BEND * np.array([up, -right])) / 2)
+    return np.asarray((start + end + layout.bend * np.array([up, -right])) / 2)
 
 
 def _write_order(axes: Any, place: npt.NDArray[np.float64], number: int) -> None:
@@ -343,7 +350,7 @@ def _tag_places(summary: Summary, layout: _Layout, size: float) -> Iterator[tupl
     centres = [on_paper(subgoal.cell) for subgoal in summary.subgoals]
     taken = [(centre, np.array([size, size])) for centre in centres]
     for here, there in pairwise(subgoals_in_order(summary)):
-        taken.append((on_paper(_middle_of_way(here, there)), np.array([number, number])))
+        taken.append((on_paper(_middle_of_way(here, there, layout)), np.array([number, number])))
     aside, above = (size + width) / 2 + 1, (size + height) / 2 + 1
     places = np.array(
         [(0, above), (0, -above), (aside, 0), (-aside, 0)]
