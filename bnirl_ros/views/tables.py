@@ -31,3 +31,13 @@ def subgoal_table(summary: Summary) -> str:
         "  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True))
         for row in table
     )
+
+
+def convergence(summary: Summary) -> str:
+    """One line on how many observations there were and how far the chains agree."""
+    rhat = "undefined" if summary.rhat is None else f"{summary.rhat:.3f}"
+    size = "undefined" if summary.ess is None else f"{summary.ess:.0f}"
+    return (
+        f"{len(summary.observations)} observations, {summary.chains} chains of {summary.draws} "
+        f"draws, R-hat {rhat}, effective sample size {size}"
+    )

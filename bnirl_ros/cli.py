@@ -1,0 +1,182 @@
+"""The `bnirl` command."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from bnirl_ros import __version__
+from bnirl_ros.errors import InputError
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status: 0, 1 for bad input, 2 for wrong arguments."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    try:
+        return int(options.run(parser, options))
+    except InputError as error:
+        print(f"bnirl: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("bnirl: stopped", file=sys.stderr)
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="bnirl", description="Tell what a demonstrator was going for."
+    )
+    parser.add_argument("--version", action="version", version=f"bnirl {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    infer = commands.add_parser("infer", help="infer the subgoals of a recorded demonstration")
+    infer.add_argument(
+        "demonstration", metavar="DEMO", type=Path, help="rosbag2 folder, .mcap file or .csv"
+    )
+    infer.add_argument(
+        "--map", type=Path, help="Nav2 map .yaml or text grid .txt; wins over a map in the bag"
+    )
+    infer.add_argument(
+        "--out", type=Path, default=Path("bnirl_out"), help="folder for the results (%(default)s)"
+    )
+    infer.add_argument(
+        "--remap",
+        action="append",
+        default=[],
+        metavar="a:=b",
+        help="read the topic a (pose, action or map) from the recorded topic b",
+    )
+    _add_settings(infer)
+    infer.set_defaults(run=_infer, command=infer)
+    return parser
+
+
+def _add_settings(parser: argparse.ArgumentParser) -> None:
+    """An option for every setting, with its range and default."""
+    from bnirl_ros.inference.settings import Settings, limits_of
+
+    for setting in fields(Settings):
+        limits = limits_of(setting)
+        words = limits.range_in_words()
+        parser.add_argument(
+            "--" + setting.name.replace("_", "-"),
+            type=type(setting.default),
+            default=setting.default,
+            choices=limits.choices or None,
+            metavar=None if limits.choices else setting.name.upper(),
+            help=f"{limits.description}{', ' * bool(words)}{words} (%(default)s)",
+        )
+
+
+def _settings(parser: argparse.ArgumentParser, options: argparse.Namespace) -> Any:
+    from bnirl_ros.inference.settings import Settings
+
+    values = {setting.name: getattr(options, setting.name) for setting in fields(Settings)}
+    try:
+        return Settings(**values)
+    except InputError as error:
+        parser.error(str(error))
+
+
+def _remappings(parser: argparse.ArgumentParser, rules: Sequence[str]) -> Mapping[str, str]:
+    """Recorded topic by the contract's name, from rules `a:=b`."""
+    from bnirl_ros.demonstrations.messages import TOPIC_TYPES
+
+    remappings = {}
+    for rule in rules:
+        name, separator, topic = rule.partition(":=")
+        name = name.removeprefix("/")
+        if not separator or not topic or name not in TOPIC_TYPES:
+            parser.error(f"--remap {rule}: must be one of {', '.join(TOPIC_TYPES)}, then :=/topic")
+        remappings[name] = topic
+    return remappings
+
+
+def _infer(_: argparse.ArgumentParser, options: argparse.Namespace) -> int:
+    """`bnirl infer`: from a file to the three result files and a table."""
+    settings = _settings(options.command, options)
+    remappings = _remappings(options.command, options.remap)
+
+    from bnirl_ros.inference.posterior import infer
+    from bnirl_ros.inference.summary import summarise
+    from bnirl_ros.maps import load_map
+    from bnirl_ros.views.results import write_results
+    from bnirl_ros.views.tables import convergence, subgoal_table
+
+    path: Path = options.demonstration
+    grid_map = load_map(options.map) if options.map else None
+    damage = None
+    if path.suffix.lower() == ".csv":
+        from bnirl_ros.demonstrations.csv_file import read_csv
+
+        if grid_map is None:
+            options.command.error(f"{path}: a CSV file tells no map; give one with --map")
+        demonstration = read_csv(path, grid_map, settings.moves)
+    else:
+        from bnirl_ros.bags.demonstration import read_demonstration
+        from bnirl_ros.demonstrations.placement import place
+
+        recorded = read_demonstration(path, remappings)
+        grid_map = grid_map or recorded.grid_map
+        damage = recorded.damage
+        for warning in recorded.warnings:
+            _warn(warning)
+        for fault, count in recorded.faults.items():
+            _warn(f"{path}: left out {count} x {fault}")
+        if grid_map is None:
+            raise InputError(f"{path}: has no map that can be used; give one with --map")
+        placement = place(recorded.recording, grid_map, settings.moves)
+        demonstration = placement.demonstration
+        for fault, count in placement.faults.items():
+            _warn(f"{path}: left out {count} x {fault}")
+        if len(demonstration) == 0:
+            raise InputError(
+                f"{path}: {damage or 'no pose and action of equal stamps lie on the map'}; "
+                "check map, frame and topics"
+            )
+    with ExitStack() as stack:
+        progress = _progress(stack, settings.sweeps * settings.chains)
+        posterior = infer(demonstration, grid_map, settings, progress)
+    summary = summarise(posterior, grid_map)
+    written = write_results(options.out, posterior, summary, grid_map, settings)
+    print(subgoal_table(summary))
+    print(convergence(summary))
+    print(f"Written: {', '.join(str(file) for file in written)}")
+    if damage:
+        raise InputError(f"{damage} The results are from what could be read")
+    return 0
+
+
+def _progress(stack: ExitStack, total: int) -> Any:
+    """A progress bar of sweeps on a terminal's standard error; nothing elsewhere."""
+    if not sys.stderr.isatty():
+        return None
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TimeRemainingColumn
+
+    bar = stack.enter_context(
+        Progress(
+            "Sampling",
+            BarColumn(),
+            TaskProgressColumn(),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+            transient=True,
+        )
+    )
+    task = bar.add_task("", total=total)
+    return lambda sweeps: bar.advance(task, sweeps)
+
+
+def _warn(sentence: str) -> None:
+    print(f"bnirl: {sentence}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

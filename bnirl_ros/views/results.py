@@ -1,0 +1,124 @@
+"""The result files of an inference: subgoals.json, posterior.npz and subgoals.png."""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from bnirl_ros.errors import InputError
+from bnirl_ros.inference.posterior import Posterior
+from bnirl_ros.inference.settings import Settings
+from bnirl_ros.inference.summary import Summary
+from bnirl_ros.maps.grid_map import GridMap
+from bnirl_ros.views.plot import draw_summary
+
+FORMAT = 1
+"""Format number of subgoals.json; added fields keep it."""
+
+
+def write_results(
+    folder: Path,
+    posterior: Posterior,
+    summary: Summary,
+    grid_map: GridMap,
+    settings: Settings,
+) -> list[Path]:
+    """Write the three result files, each whole or not at all; returns their paths.
+
+    Raises:
+        InputError: the folder cannot be written to.
+    """
+    text = json.dumps(subgoals_document(summary, grid_map, settings), indent=2) + "\n"
+    writers: dict[str, Callable[[Path], object]] = {
+        "subgoals.json": lambda path: path.write_text(text, encoding="utf-8"),
+        "posterior.npz": lambda path: write_arrays(path, posterior_arrays(posterior)),
+        "subgoals.png": lambda path: draw_summary(summary, grid_map, path),
+    }
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, write in writers.items():
+            partial = folder / f".partial-{name}"
+            try:
+                write(partial)
+                partial.replace(folder / name)
+            finally:
+                partial.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{folder}: the results cannot be written there ({error.strerror}); "
+            "choose another folder"
+        ) from error
+    return [folder / name for name in writers]
+
+
+def subgoals_document(summary: Summary, grid_map: GridMap, settings: Settings) -> dict[str, Any]:
+    """The content of subgoals.json."""
+    return {
+        "format": FORMAT,
+        "frame_id": grid_map.frame_id,
+        "resolution": grid_map.resolution,
+        "model": {
+            "name": settings.model,
+            "alpha": settings.alpha,
+            "eta": settings.eta,
+            "discount": settings.discount,
+            "success": settings.success,
+        },
+        "subgoals": [
+            {
+                "rank": subgoal.rank,
+                "cell": list(subgoal.cell),
+                "position": list(subgoal.position),
+                "probability": subgoal.probability,
+                "observations": subgoal.observations,
+                "visit_order": list(subgoal.visit_order),
+            }
+            for subgoal in summary.subgoals
+        ],
+        "diagnostics": {
+            "rhat": _finite(summary.rhat),
+            "ess": _finite(summary.ess),
+            "chains": summary.chains,
+            "draws": summary.draws,
+        },
+    }
+
+
+def posterior_arrays(posterior: Posterior) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of posterior.npz."""
+    return {
+        "candidates": posterior.candidates,
+        "observations": posterior.demonstration.observations,
+        "subgoal_of": posterior.draws.subgoal_of,
+        "partition_of": posterior.draws.partition_of,
+        "log_joint": posterior.draws.log_joint,
+        "mode_subgoal_of": posterior.mode.subgoal_of,
+        "mode_partition_of": posterior.mode.partition_of,
+    }
+
+
+def write_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    """Write a compressed .npz, quickly, and with the same bytes for the same arrays.
+
+    `np.savez_compressed` spends ten times as long on the draws of a long demonstration to save a
+    little more space, and writes the time of day into the file.
+    """
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, values in arrays.items():
+            member = zipfile.ZipInfo(f"{name}.npy")
+            member.compress_type = zipfile.ZIP_DEFLATED
+            member._compresslevel = 1  # type: ignore[attr-defined]
+            with archive.open(member, "w", force_zip64=True) as file:
+                np.lib.format.write_array(file, np.ascontiguousarray(values), allow_pickle=False)
+
+
+def _finite(value: float | None) -> float | None:
+    """JSON has no infinity: chains that each stand still have no variance to judge by."""
+    return value if value is not None and math.isfinite(value) else None
