@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -44,7 +44,7 @@ class Topic:
         name: as recorded.
         type_name: `package/msg/Type`; empty where the bag doesn't say.
         messages: how many, as far as the bag says or could be read.
-        qos: what its publishers offered; empty where the bag doesn't say.
+        qos: what each of its publishers offered; empty where the bag doesn't say.
         encoding: of its messages' bytes; only `cdr` can be decoded.
         type_hash: `RIHS01_...`; empty where the bag doesn't say.
     """
@@ -120,18 +120,9 @@ class Bag:
         found: dict[tuple[str, str, str], Topic] = {}
         for file in self._files:
             for channel in file.channels.values():
-                known = found.get((channel.topic, file.type_of(channel), channel.encoding))
                 topic = file.topic(channel)
-                if known is not None:
-                    topic = Topic(
-                        name=topic.name,
-                        type_name=topic.type_name,
-                        messages=known.messages + topic.messages,
-                        qos=known.qos + tuple(new for new in topic.qos if new not in known.qos),
-                        encoding=topic.encoding,
-                        type_hash=known.type_hash or topic.type_hash,
-                    )
-                found[topic.name, topic.type_name, topic.encoding] = topic
+                key = (topic.name, topic.type_name, topic.encoding)
+                found[key] = _joined(found[key], topic) if key in found else topic
         return [found[key] for key in sorted(found)]
 
     def messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
@@ -204,6 +195,16 @@ def _listed_files(folder: Path) -> tuple[list[Path], str | None]:
     return listed, None
 
 
+def _joined(first: Topic, second: Topic) -> Topic:
+    """One topic that two files, or two channels of a file, hold."""
+    return replace(
+        first,
+        messages=first.messages + second.messages,
+        qos=first.qos + tuple(new for new in second.qos if new not in first.qos),
+        type_hash=first.type_hash or second.type_hash,
+    )
+
+
 def _merged(
     merging: list[tuple[int, int, int, int, list[RawMessage]]], until: int | None
 ) -> Iterator[RawMessage]:
@@ -270,9 +271,9 @@ class _File:
         if not self.faults:
             return None
         offset, reason = min(self.faults.items())
-        more = f" (and in {len(self.faults) - 1} more places)" if len(self.faults) > 1 else ""
+        places = "" if len(self.faults) == 1 else f"in {len(self.faults)} places, the first "
         return (
-            f"{self.path} is damaged at byte {offset}{more}: {reason}; {self.messages_read} "
+            f"{self.path} is damaged {places}at byte {offset}: {reason}; {self.messages_read} "
             "messages could be read."
         )
 
@@ -406,8 +407,8 @@ def _check_magic(path: Path, beginning: bytes) -> None:
 
 def _unreadable(path: Path, fault: OSError) -> InputError:
     return InputError(
-        f"{path} cannot be read ({fault.strerror}): check that it is a file or folder that you may "
-        "read."
+        f"{path} cannot be read ({fault.strerror}): check that it is a file or folder that you "
+        "may read."
     )
 
 

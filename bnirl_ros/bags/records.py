@@ -84,7 +84,7 @@ class StoredMessage(NamedTuple):
 
 @dataclass
 class Contents:
-    """What a stretch of records holds; `damage` says why it ends early, if it does."""
+    """What a stretch of records holds; `damage` says why something is missing, if it is."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
@@ -126,17 +126,25 @@ def contents_of(data: bytes) -> Contents:
     contents = Contents()
     try:
         for opcode, start, end in records_in(data):
-            if opcode == Opcode.MESSAGE:
-                contents.messages.append(_message(data, start, end))
-            elif opcode == Opcode.CHANNEL:
-                channel = parse_channel(data[start:end])
-                contents.channels[channel.id] = channel
-            elif opcode == Opcode.SCHEMA:
-                schema = parse_schema(data[start:end])
-                contents.schemas[schema.id] = schema
+            try:
+                _add_record(contents, opcode, data, start, end)
+            except DamageError as damage:
+                # The frame is whole, so the records after this one can still be read.
+                contents.damage = contents.damage or str(damage)
     except DamageError as damage:
-        contents.damage = str(damage)
+        contents.damage = contents.damage or str(damage)
     return contents
+
+
+def _add_record(contents: Contents, opcode: int, data: bytes, start: int, end: int) -> None:
+    if opcode == Opcode.MESSAGE:
+        contents.messages.append(_message(data, start, end))
+    elif opcode == Opcode.CHANNEL:
+        channel = parse_channel(data[start:end])
+        contents.channels[channel.id] = channel
+    elif opcode == Opcode.SCHEMA:
+        schema = parse_schema(data[start:end])
+        contents.schemas[schema.id] = schema
 
 
 def contents_of_chunk(data: bytes) -> Contents:
@@ -259,7 +267,9 @@ def _unpack_chunk(content: bytes) -> tuple[bytes, str | None]:
     if size > CHUNK_LIMIT:
         raise DamageError(f"a chunk claims to unpack to {size} bytes, more than {CHUNK_LIMIT}")
     if compression not in _UNPACKERS:
-        raise DamageError(f"a chunk is compressed by {compression!r}, which is no zstd or lz4")
+        raise DamageError(
+            f"a chunk is compressed by {compression[:20]!r}, which is no zstd or lz4"
+        )
     unpacked, damage = _UNPACKERS[compression](packed, size)
     if len(packed) < packed_size:
         damage = "a chunk breaks off"
