@@ -170,7 +170,6 @@ class BagWriter:
         writer = self._open_writer()
         assert self._stream is not None
         metadata = self._metadata()
-        writer.flush()  # type: ignore[no-untyped-call]
         writer.add_metadata("rosbag2", {"serialized_metadata": metadata})
         writer.finish()  # type: ignore[no-untyped-call]
         self._stream.close()
