@@ -3,29 +3,40 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from threading import Thread
+from typing import TYPE_CHECKING, Any
 
 from bnirl_ros import __version__
 from bnirl_ros.errors import InputError
 
+if TYPE_CHECKING:  # what a command needs is imported when it runs, so that --help is quick
+    from bnirl_ros.demonstrations.demonstration import Demonstration
+    from bnirl_ros.inference.settings import Settings
+    from bnirl_ros.maps.grid_map import GridMap
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status: 0, 1 for bad input, 2 for wrong arguments."""
-    parser = _parser()
-    options = parser.parse_args(arguments)
+    # A command lives so short that collecting garbage, while libraries are imported and again at
+    # the end, would be a fifth of its time.
+    gc.disable()
     try:
-        return int(options.run(parser, options))
+        options = _parser().parse_args(arguments)
+        return int(options.run(options))
     except InputError as error:
         print(f"bnirl: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("bnirl: stopped", file=sys.stderr)
         return 130
+    finally:
+        gc.freeze()
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -74,7 +85,7 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
         )
 
 
-def _settings(parser: argparse.ArgumentParser, options: argparse.Namespace) -> Any:
+def _settings(parser: argparse.ArgumentParser, options: argparse.Namespace) -> Settings:
     from bnirl_ros.inference.settings import Settings
 
     values = {setting.name: getattr(options, setting.name) for setting in fields(Settings)}
@@ -98,48 +109,19 @@ def _remappings(parser: argparse.ArgumentParser, rules: Sequence[str]) -> Mappin
     return remappings
 
 
-def _infer(_: argparse.ArgumentParser, options: argparse.Namespace) -> int:
+def _infer(options: argparse.Namespace) -> int:
     """`bnirl infer`: from a file to the three result files and a table."""
     settings = _settings(options.command, options)
     remappings = _remappings(options.command, options.remap)
 
     from bnirl_ros.inference.posterior import infer
     from bnirl_ros.inference.summary import summarise
-    from bnirl_ros.maps import load_map
+    from bnirl_ros.views.plot import import_matplotlib
     from bnirl_ros.views.results import write_results
     from bnirl_ros.views.tables import convergence, subgoal_table
 
-    path: Path = options.demonstration
-    grid_map = load_map(options.map) if options.map else None
-    damage = None
-    if path.suffix.lower() == ".csv":
-        from bnirl_ros.demonstrations.csv_file import read_csv
-
-        if grid_map is None:
-            options.command.error(f"{path}: a CSV file tells no map; give one with --map")
-        demonstration = read_csv(path, grid_map, settings.moves)
-    else:
-        from bnirl_ros.bags.demonstration import read_demonstration
-        from bnirl_ros.demonstrations.placement import place
-
-        recorded = read_demonstration(path, remappings)
-        grid_map = grid_map or recorded.grid_map
-        damage = recorded.damage
-        for warning in recorded.warnings:
-            _warn(warning)
-        for fault, count in recorded.faults.items():
-            _warn(f"{path}: left out {count} x {fault}")
-        if grid_map is None:
-            raise InputError(f"{path}: has no map that can be used; give one with --map")
-        placement = place(recorded.recording, grid_map, settings.moves)
-        demonstration = placement.demonstration
-        for fault, count in placement.faults.items():
-            _warn(f"{path}: left out {count} x {fault}")
-        if len(demonstration) == 0:
-            raise InputError(
-                f"{path}: {damage or 'no pose and action of equal stamps lie on the map'}; "
-                "check map, frame and topics"
-            )
+    demonstration, grid_map, damage = _read(options, settings, remappings)
+    Thread(target=import_matplotlib, daemon=True).start()  # while the chains leave the GIL alone
     with ExitStack() as stack:
         progress = _progress(stack, settings.sweeps * settings.chains)
         posterior = infer(demonstration, grid_map, settings, progress)
@@ -151,6 +133,43 @@ def _infer(_: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     if damage:
         raise InputError(f"{damage} The results are from what could be read")
     return 0
+
+
+def _read(
+    options: argparse.Namespace, settings: Settings, remappings: Mapping[str, str]
+) -> tuple[Demonstration, GridMap, str | None]:
+    """The demonstration, its map, and a sentence on damage to the file, if there is any."""
+    from bnirl_ros.maps import load_map
+
+    path: Path = options.demonstration
+    command: argparse.ArgumentParser = options.command
+    given_map = load_map(options.map) if options.map else None
+    if path.suffix.lower() == ".csv":
+        from bnirl_ros.demonstrations.csv_file import read_csv
+
+        if given_map is None:
+            command.error(f"{path}: a CSV file tells no map; give one with --map")
+        return read_csv(path, given_map, settings.moves), given_map, None
+
+    from bnirl_ros.bags.demonstration import read_demonstration
+    from bnirl_ros.demonstrations.placement import place
+
+    recorded = read_demonstration(path, remappings)
+    grid_map = given_map or recorded.grid_map
+    for warning in recorded.warnings:
+        _warn(warning)
+    if grid_map is None:
+        reasons = "".join(f" ({fault})" for fault in recorded.faults if "map" in fault)
+        raise InputError(f"{path}: has no map that can be used{reasons}; give one with --map")
+    placement = place(recorded.recording, grid_map, settings.moves)
+    for fault, count in (recorded.faults + placement.faults).items():
+        _warn(f"{path}: left out {count} x {fault}")
+    if len(placement.demonstration) == 0:
+        raise InputError(
+            f"{path}: {recorded.damage or 'no pose and action of equal stamps lie on the map'}; "
+            "check its topics, their frame and the map"
+        )
+    return placement.demonstration, grid_map, recorded.damage
 
 
 def _progress(stack: ExitStack, total: int) -> Any:

@@ -6,10 +6,10 @@ import time
 
 import numpy as np
 import pytest
-from bag_support import messages, same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bag_support import messages, same
 from bnirl_ros.bags.cdr import decode, encode
 from bnirl_ros.bags.definitions import known_types
 from bnirl_ros.errors import InputError

@@ -4,10 +4,10 @@ import json
 from pathlib import Path
 
 import pytest
-from bag_support import SHARED_BAGS, needs_ros_definitions, needs_shared_bags, ros_share
 from mcap.records import Schema
 from mcap.stream_reader import StreamReader
 
+from bag_support import SHARED_BAGS, needs_ros_definitions, needs_shared_bags, ros_share
 from bnirl_ros.bags import definitions
 from bnirl_ros.bags.definitions import (
     full_type_name,

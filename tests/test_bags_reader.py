@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from bag_support import SHARED_BAGS, needs_shared_bags
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 
+from bag_support import SHARED_BAGS, needs_shared_bags
 from bnirl_ros.bags.reader import Bag, RawMessage
 from bnirl_ros.errors import InputError
 

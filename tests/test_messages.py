@@ -6,8 +6,8 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from bag_support import same
 
+from bag_support import same
 from bnirl_ros.bags.definitions import known_types, typestore_with
 from bnirl_ros.views.messages import (
     MESSAGE_TYPES,

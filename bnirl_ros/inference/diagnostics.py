@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from statistics import NormalDist
+
 import numpy as np
 import numpy.typing as npt
 
@@ -66,12 +68,11 @@ def _split(chains: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 def _rank_normalised(chains: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Normal scores of the average ranks over all chains (Blom's offsets)."""
-    from scipy.special import ndtri  # here: only diagnostics need it, and start-up time counts
-
     _, index, counts = np.unique(chains, return_inverse=True, return_counts=True)
-    rank = (np.cumsum(counts) - (counts - 1) / 2.0)[index.reshape(-1)]
-    scores = ndtri((rank - 0.375) / (chains.size + 0.25))
-    return np.asarray(scores.reshape(chains.shape))
+    ranks = np.cumsum(counts) - (counts - 1) / 2.0
+    normal = NormalDist()  # not scipy's, which would cost the command 0.1 s at its start
+    scores = np.array([normal.inv_cdf(p) for p in (ranks - 0.375) / (chains.size + 0.25)])
+    return scores[index].reshape(chains.shape)
 
 
 def _plain_rhat(chains: npt.NDArray[np.float64]) -> float:

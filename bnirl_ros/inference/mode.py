@@ -65,6 +65,7 @@ def ascend(
     partition's subgoal; a whole subgoal given up, its observations to the next best; a whole
     subgoal taken up, with the observations that it explains better.
     """
+    alone = mixture.log_prior + mixture.log_likelihood
     labels, first = np.unique(np.asarray(partition_of), return_index=True)
     state = PartitionState.from_subgoals(
         np.searchsorted(labels, np.asarray(partition_of)), np.asarray(subgoal_of)[first]
@@ -75,6 +76,8 @@ def ascend(
         mixture.eta,
         mixture.pair_of,
         np.argsort(mixture.pair_of, kind="stable"),
+        alone.argmax(axis=1),
+        alone.max(axis=1) + math.log(mixture.eta),
         *state.arrays(),
     )
     _, first, index = np.unique(state.partition_of, return_index=True, return_inverse=True)
@@ -93,6 +96,8 @@ def _ascend(  # type: ignore[no-untyped-def]
     eta,
     pair_of,
     by_pair,
+    best_alone,
+    value_alone,
     partition_of,
     subgoal_of_slot,
     size_of_slot,
@@ -100,7 +105,8 @@ def _ascend(  # type: ignore[no-untyped-def]
     position_of_slot,
     occupied,
 ):
-    model = (log_likelihood, log_prior, eta, pair_of, by_pair)
+    """See `ascend`. `best_alone`, `value_alone` (K,): what a partition of one's own is worth."""
+    model = (log_likelihood, log_prior, eta, pair_of, by_pair, best_alone, value_alone)
     state = (partition_of, subgoal_of_slot, size_of_slot, slots, position_of_slot, occupied)
     best = _climb(model, state)
     gained = True
@@ -155,7 +161,7 @@ def _assign(state, other):  # type: ignore[no-untyped-def]
 @njit(nogil=True, cache=True)
 def _climb(model, state):  # type: ignore[no-untyped-def]
     """Single observations and partitions' subgoals until nothing gains; returns log of (10)."""
-    log_likelihood, log_prior, eta, pair_of, by_pair = model
+    log_likelihood, log_prior, eta, pair_of, by_pair, _, _ = model
     partition_of, subgoal_of_slot, size_of_slot, slots, position_of_slot, occupied = state
     moved = True
     while moved:
@@ -187,12 +193,10 @@ def _climb(model, state):  # type: ignore[no-untyped-def]
 @njit(nogil=True, cache=True)
 def _move_one(model, state, i):  # type: ignore[no-untyped-def]
     """Move observation i to the partition where (10) is largest; whether that gained."""
-    log_likelihood, log_prior, eta, pair_of, _ = model
+    log_likelihood, log_prior, eta, pair_of, _, best_alone, value_alone = model
     partition_of, subgoal_of_slot, size_of_slot, slots, position_of_slot, occupied = state
     row = log_likelihood[pair_of[i]]
     old = partition_of[i]
-    candidate = (log_prior + row).argmax()
-    alone = math.log(eta) + log_prior[candidate] + row[candidate]
     take_out(i, partition_of, size_of_slot, slots, position_of_slot, occupied)
     if size_of_slot[old] > 0:
         stays = math.log(size_of_slot[old]) + row[subgoal_of_slot[old]]
@@ -206,10 +210,10 @@ def _move_one(model, state, i):  # type: ignore[no-untyped-def]
         if value > best:
             best = value
             target = position
-    if alone > best:
-        best = alone
+    if value_alone[pair_of[i]] > best:
+        best = value_alone[pair_of[i]]
         target = occupied[0]
-        subgoal_of_slot[slots[target]] = candidate
+        subgoal_of_slot[slots[target]] = best_alone[pair_of[i]]
     put_in(i, target, partition_of, size_of_slot, slots, occupied)
     return best > stays + _GAIN
 
@@ -217,7 +221,7 @@ def _move_one(model, state, i):  # type: ignore[no-untyped-def]
 @njit(nogil=True, cache=True)
 def _give_up(model, state, position):  # type: ignore[no-untyped-def]
     """Move every observation of the partition at `position` to the best of the others."""
-    log_likelihood, _, _, pair_of, _ = model
+    log_likelihood, _, _, pair_of, _, _, _ = model
     partition_of, subgoal_of_slot, size_of_slot, slots, position_of_slot, occupied = state
     if occupied[0] < 2:
         return
@@ -242,7 +246,7 @@ def _give_up(model, state, position):  # type: ignore[no-untyped-def]
 @njit(nogil=True, cache=True)
 def _take_up(model, state, candidate):  # type: ignore[no-untyped-def]
     """Gather in a new partition what `candidate` explains better; whether there is any."""
-    log_likelihood, _, _, pair_of, _ = model
+    log_likelihood, _, _, pair_of, _, _, _ = model
     partition_of, subgoal_of_slot, size_of_slot, slots, position_of_slot, occupied = state
     taken_up = -1
     for i in range(partition_of.shape[0]):

@@ -57,6 +57,18 @@ class _Layout:
     bend: float
 
 
+def import_matplotlib() -> tuple[Any, Any]:
+    """matplotlib's Figure and FigureCanvasAgg, imported when first asked for.
+
+    That takes longer than most inferences, so that a caller may want to have it done meanwhile.
+    pyplot is left alone: it would keep every figure, and may look for a screen.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    return Figure, FigureCanvasAgg
+
+
 def draw_summary(
     summary: Summary, grid_map: GridMap, path: str | Path, title: str | None = None
 ) -> None:
@@ -77,15 +89,11 @@ def draw_summary(
     Raises:
         OSError: the file cannot be written.
     """
-    # Only here, since importing it takes longer than most inferences; and without pyplot, which
-    # would keep the figure, and may look for a screen.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
+    figure_class, canvas_class = import_matplotlib()
     layout = _layout(grid_map, len(summary.subgoals), _TOP if title is None else _TITLED_TOP)
     width, height = layout.figure
-    figure = Figure(figsize=layout.figure, dpi=_DOTS_PER_INCH, facecolor="white")
-    canvas: Any = FigureCanvasAgg(figure)
+    figure = figure_class(figsize=layout.figure, dpi=_DOTS_PER_INCH, facecolor="white")
+    canvas = canvas_class(figure)
     axes = figure.add_axes(
         (
             _LEFT / width,
