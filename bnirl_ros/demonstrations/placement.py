@@ -19,9 +19,17 @@ EPISODE_GAP = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """A demonstration on a map, and what of the recording did not fit, counted by fault."""
+    """A demonstration on a map, and what of the recording did not fit.
+
+    Attributes:
+        demonstration: its N observations.
+        poses: (N,) index into the recording's poses of each observation: as a recording only
+            grows, that tells which observations are the same in a later placement.
+        faults: what did not fit, counted by fault.
+    """
 
     demonstration: Demonstration
+    poses: npt.NDArray[np.int64]
     faults: Counter[str]
 
 
@@ -83,7 +91,7 @@ def place(
         last_episode=np.searchsorted(numbers, episode[kept]),
         last_cells=cells[kept],
     )
-    return Placement(demonstration, faults)
+    return Placement(demonstration, np.flatnonzero(in_frame)[observed], faults)
 
 
 def episode_starts(

@@ -46,7 +46,7 @@ class PartitionState:
     def from_subgoals(
         cls, partition_of: npt.ArrayLike, subgoal_of_partition: npt.ArrayLike
     ) -> PartitionState:
-        """From partitions numbered 0 to J - 1 without gaps, and their subgoals (J,)."""
+        """From partitions numbered 0 to J - 1 without gaps (-1: in none), and subgoals (J,)."""
         partitions = np.asarray(partition_of, dtype=np.int32).copy()
         subgoals = np.asarray(subgoal_of_partition, dtype=np.int32)
         count = len(partitions)
@@ -55,7 +55,9 @@ class PartitionState:
         return cls(
             partition_of=partitions,
             subgoal_of_slot=subgoal_of_slot,
-            size_of_slot=np.bincount(partitions, minlength=count).astype(np.int32),
+            size_of_slot=np.bincount(partitions[partitions >= 0], minlength=count).astype(
+                np.int32
+            ),
             slots=np.arange(count, dtype=np.int32),
             position_of_slot=np.arange(count, dtype=np.int32),
             occupied=np.array([len(subgoals)], dtype=np.int32),
@@ -77,6 +79,50 @@ def initial_state(mixture: SubgoalMixture, generator: np.random.Generator) -> Pa
     """Step 1(b) of Algorithm 2: one partition, its subgoal drawn from the prior."""
     subgoal = generator.choice(len(mixture.log_prior), p=np.exp(mixture.log_prior))
     return PartitionState.from_subgoals(np.zeros(len(mixture.pair_of)), [subgoal])
+
+
+def seat(
+    mixture: SubgoalMixture,
+    partition_of: npt.ArrayLike,
+    subgoal_of: npt.ArrayLike,
+    generator: np.random.Generator,
+) -> PartitionState:
+    """A state that goes on from an older one, with observations that are new to it.
+
+    Args:
+        mixture: the model of all N observations.
+        partition_of: (N,) partition of each observation, any numbers; -1 for the new ones, which
+            are seated one by one by (14) given those before.
+        subgoal_of: (N,) candidate index of each observation's subgoal; -1 for the new ones.
+        generator: source of randomness.
+    """
+    old = np.asarray(partition_of, dtype=np.int64)
+    is_new = old < 0
+    labels, first, index = np.unique(old[~is_new], return_index=True, return_inverse=True)
+    if len(labels) == 0:
+        return initial_state(mixture, generator)
+    state = PartitionState.from_subgoals(
+        _filled(old.shape, ~is_new, index), np.asarray(subgoal_of)[~is_new][first]
+    )
+    _draw_partitions(
+        mixture.scaled_likelihood,
+        mixture.new_partition_weight,
+        np.exp(mixture.log_prior),
+        mixture.pair_of,
+        np.flatnonzero(is_new),
+        generator,
+        *state.arrays(),
+    )
+    return state
+
+
+def _filled(
+    shape: tuple[int, ...], where: npt.NDArray[np.bool_], values: npt.NDArray[np.int64]
+) -> npt.NDArray[np.int64]:
+    """`values` at `where`, -1 elsewhere."""
+    filled = np.full(shape, -1, dtype=np.int64)
+    filled[where] = values.reshape(-1)
+    return filled
 
 
 def advance(
@@ -130,6 +176,7 @@ def _advance(  # type: ignore[no-untyped-def]
     drawn_log_joint,
 ):
     prior = np.exp(log_prior)
+    everyone = np.arange(partition_of.shape[0])
     label_of_slot = np.empty(partition_of.shape[0], dtype=np.int32)
     for draw in range(drawn_log_joint.shape[0]):
         for _ in range(thin):
@@ -149,8 +196,8 @@ def _advance(  # type: ignore[no-untyped-def]
                 scaled_likelihood,
                 new_partition_weight,
                 prior,
-                eta,
                 pair_of,
+                everyone,
                 generator,
                 partition_of,
                 subgoal_of_slot,
@@ -238,8 +285,8 @@ def _draw_partitions(  # type: ignore[no-untyped-def]
     scaled_likelihood,
     new_partition_weight,
     prior,
-    eta,
     pair_of,
+    chosen,
     generator,
     partition_of,
     subgoal_of_slot,
@@ -248,11 +295,12 @@ def _draw_partitions(  # type: ignore[no-untyped-def]
     position_of_slot,
     occupied,
 ):
-    """Step 2(b): every observation's partition from (14), as if it had come last."""
+    """Step 2(b): the chosen observations' partitions from (14), each as if it had come last."""
     weights = np.empty(partition_of.shape[0] + 1)
-    for i in range(partition_of.shape[0]):
+    for i in chosen:
         pair = pair_of[i]
-        take_out(i, partition_of, size_of_slot, slots, position_of_slot, occupied)
+        if partition_of[i] >= 0:
+            take_out(i, partition_of, size_of_slot, slots, position_of_slot, occupied)
         count = occupied[0]
         total = 0.0
         for position in range(count):

@@ -1,0 +1,210 @@
+"""Inference in a thread of its own, so that whoever receives observations never waits for it."""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+from threading import Condition, Event, Thread
+
+from bnirl_ros.demonstrations.placement import Placement, place
+from bnirl_ros.demonstrations.recording import Recorder
+from bnirl_ros.errors import InputError
+from bnirl_ros.inference.chains import StoppedError
+from bnirl_ros.inference.posterior import Posterior, infer
+from bnirl_ros.inference.running import RunningPosterior
+from bnirl_ros.inference.settings import Settings
+from bnirl_ros.inference.summary import Summary, summarise
+from bnirl_ros.maps.grid_map import GridMap
+
+_ROUND = 0.25  # [s] aimed at between two results: time for sweeps, not for repeating itself
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A result of the background inference.
+
+    Attributes:
+        grid_map: the map on which it was found.
+        placement: the observations that it is about, and what did not fit.
+        summary: what the posterior says; None while there is no observation.
+        sweeps: sweeps of each chain.
+        posterior, settings: of an inference that was asked for; None for a running result.
+    """
+
+    grid_map: GridMap
+    placement: Placement
+    summary: Summary | None
+    sweeps: int
+    posterior: Posterior | None = None
+    settings: Settings | None = None
+
+
+class BackgroundInference:
+    """Keeps a posterior up to date with a recorder, in a thread of its own.
+
+    All methods return at once. Whatever goes wrong in the thread is kept as `error` and the next
+    change tried again: it never ends before `close`.
+
+    Attributes:
+        error: the last thing that went wrong, in one sentence; empty if nothing did.
+    """
+
+    def __init__(self, recorder: Recorder, settings: Settings, episode_gap: float) -> None:
+        """Start the thread; it waits for a map and observations."""
+        self.error = ""
+        self._recorder = recorder
+        self._settings = settings
+        self._episode_gap = episode_gap
+        self._grid_map: GridMap | None = None
+        self._changed = False
+        self._paused = False
+        self._closed = False
+        self._requests: list[Future[Result]] = []
+        self._result: Result | None = None
+        self._running: RunningPosterior | None = None
+        self._stands = False  # the last result was asked for, and nothing has changed since
+        self._forget = False
+        self._stop = Event()
+        self._wake = Condition()
+        self._thread = Thread(target=self._run, name="inference", daemon=True)
+        self._thread.start()
+
+    def observations_arrived(self) -> None:
+        """There is something new in the recorder."""
+        if not self._changed:  # a plain look first: this is called for every message
+            self._update(_changed=True)
+
+    def use_map(self, grid_map: GridMap) -> None:
+        """Put all observations on this map from now on."""
+        self._update(_grid_map=grid_map, _changed=True)
+
+    def use_settings(self, settings: Settings) -> None:
+        """Go on with these settings."""
+        self._update(_settings=settings, _changed=True)
+
+    def pause(self, paused: bool) -> None:
+        """Let running inference rest, or go on; inferences asked for are made all the same."""
+        self._update(_paused=paused)
+
+    @property
+    def paused(self) -> bool:
+        """Whether running inference rests."""
+        return self._paused
+
+    @property
+    def idle(self) -> bool:
+        """Whether there is nothing to do."""
+        with self._wake:
+            return not self._has_work()
+
+    def reset(self) -> None:
+        """Forget the chains; the recorder was cleared."""
+        self._update(_forget=True, _changed=True)
+
+    def infer(self) -> Future[Result]:
+        """Ask for an inference with fresh chains over all observations so far.
+
+        The future gets the result, or the `InputError` that says why there is none; it is
+        cancelled when this is closed before.
+        """
+        request: Future[Result] = Future()
+        with self._wake:
+            self._requests.append(request)
+            self._wake.notify()
+        return request
+
+    def take_result(self) -> Result | None:
+        """The newest result since the last call, if there is one."""
+        with self._wake:
+            result, self._result = self._result, None
+        return result
+
+    def close(self) -> None:
+        """End the thread, as soon as the sweeps under way are done."""
+        self._stop.set()
+        self._update(_closed=True)
+        self._thread.join()
+
+    def _update(self, **values: object) -> None:
+        with self._wake:
+            vars(self).update(values)
+            self._wake.notify()
+
+    def _has_work(self) -> bool:
+        changed = self._changed and self._grid_map is not None
+        unfinished = self._running is not None and not self._running.finished
+        running = changed or (unfinished and not self._stands)
+        return bool(self._closed or self._requests or (running and not self._paused))
+
+    def _run(self) -> None:
+        while True:
+            with self._wake:
+                self._wake.wait_for(self._has_work)
+                if self._closed:
+                    for waiting in self._requests:
+                        waiting.cancel()
+                    return
+                request = self._requests.pop(0) if self._requests else None
+            try:
+                if request:
+                    self._answer(request)
+                else:
+                    self._publish(self._next_running_result())
+                self.error = ""
+            except Exception as error:  # a thread that died would go unnoticed
+                self.error = f"{type(error).__name__}: {error}"
+                self._running = None
+                if request and not request.done():
+                    request.set_exception(error)
+
+    def _publish(self, result: Result) -> None:
+        with self._wake:
+            self._result = result
+
+    def _place(self) -> tuple[Placement, GridMap, Settings]:
+        """What was recorded, on the present map."""
+        with self._wake:
+            self._changed = self._stands = False
+            grid_map, settings = self._grid_map, self._settings
+            if self._forget:
+                self._running, self._forget = None, False
+        if grid_map is None:
+            raise InputError("there is no map yet; publish one, latched, on the topic map")
+        recording = self._recorder.snapshot()
+        return place(recording, grid_map, settings.moves, self._episode_gap), grid_map, settings
+
+    def _answer(self, request: Future[Result]) -> None:
+        """Infer with fresh chains."""
+        try:
+            placement, grid_map, settings = self._place()
+            posterior = infer(placement.demonstration, grid_map, settings, stop=self._stop)
+        except InputError as error:
+            self._changed = True  # what is new was taken note of, but not taken in
+            request.set_exception(error)
+            return
+        except StoppedError:
+            request.cancel()
+            return
+        summary = summarise(posterior, grid_map)
+        result = Result(grid_map, placement, summary, settings.sweeps, posterior, settings)
+        self._stands = True
+        self._publish(replace(result, posterior=None))
+        request.set_result(result)
+
+    def _next_running_result(self) -> Result:
+        """Take in what is new, and go on for a round."""
+        if self._changed or self._running is None:
+            placement, grid_map, settings = self._place()
+            if len(placement.demonstration) == 0:
+                self._running = None
+                return Result(grid_map, placement, None, 0)
+            self._running = RunningPosterior(placement, grid_map, settings, self._running)
+        running = self._running
+        start = time.monotonic()
+        while True:
+            running.advance(4)
+            if self._changed or running.finished or time.monotonic() - start > _ROUND:
+                break
+        summary = summarise(running.posterior(), running.grid_map)
+        return Result(running.grid_map, running.placement, summary, running.sweeps)

@@ -1,0 +1,123 @@
+"""Chains that go on while observations arrive: warm-started, in bounded memory."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import numpy.typing as npt
+
+from bnirl_ros.demonstrations.placement import Placement
+from bnirl_ros.inference import partition_gibbs as sampler
+from bnirl_ros.inference.draws import Draws
+from bnirl_ros.inference.posterior import Posterior, paper_model, posterior_of
+from bnirl_ros.inference.settings import Settings
+from bnirl_ros.maps.grid_map import GridMap
+
+CAPACITY = 128
+"""Draws kept of each chain; even, and enough for R-hat to tell 1.05 from 1."""
+
+
+class RunningPosterior:
+    """The posterior of what was observed so far, from chains that never start again.
+
+    Draws count from the last change of the observations. When there is no more room for them,
+    every second one is dropped and every second sweep left out from then on, so that memory stays
+    bounded and the draws span all sweeps. Its results agree with those of fresh chains, but are
+    not equal to them.
+
+    Attributes:
+        placement, grid_map, settings: what it is the posterior of.
+        sweeps: sweeps of each chain so far.
+    """
+
+    def __init__(
+        self,
+        placement: Placement,
+        grid_map: GridMap,
+        settings: Settings,
+        before: RunningPosterior | None = None,
+    ) -> None:
+        """Chains over a demonstration with at least one observation.
+
+        Where there is a posterior from `before`, of other observations, another map or other
+        settings, its chains go on: what was observed then keeps its partition and subgoal, as far
+        as the subgoal is still a candidate, and new observations are seated by (14). With another
+        seed, or another number of chains, they start anew.
+        """
+        self.placement, self.grid_map, self.settings = placement, grid_map, settings
+        self.sweeps = 0
+        self._candidates, self._mixture = paper_model(placement.demonstration, grid_map, settings)
+        self._draws = Draws.empty((settings.chains, CAPACITY), len(placement.poses))
+        self._kept, self._thin = 0, 1
+        self._generators: list[np.random.Generator]
+        self._states: list[sampler.PartitionState]
+        if before and (settings.chains, settings.seed) == (
+            before.settings.chains,
+            before.settings.seed,
+        ):
+            self._generators = before._generators
+            self._states = self._states_going_on(before)
+        else:
+            seeds = np.random.SeedSequence(settings.seed).spawn(settings.chains)
+            self._generators = [np.random.default_rng(seed) for seed in seeds]
+            self._states = [
+                sampler.initial_state(self._mixture, generator) for generator in self._generators
+            ]
+
+    @property
+    def finished(self) -> bool:
+        """Whether there were as many sweeps as the settings ask for."""
+        return self.sweeps >= self.settings.sweeps
+
+    def advance(self, draws: int) -> None:
+        """Go on for so many further draws of each chain, or fewer where room is short."""
+        if self._kept == CAPACITY:
+            for values in vars(self._draws).values():
+                values[:, : CAPACITY // 2] = values[:, 1::2].copy()
+            self._kept //= 2
+            self._thin *= 2
+        end = min(self._kept + draws, CAPACITY)
+
+        def run_chain(chain: int) -> None:
+            part = self._draws[chain][self._kept : end]
+            state, generator = self._states[chain], self._generators[chain]
+            sampler.advance(self._mixture, state, generator, part, self._thin)
+
+        with ThreadPoolExecutor(min(len(self._states), os.cpu_count() or 1)) as threads:
+            list(threads.map(run_chain, range(len(self._states))))
+        self.sweeps += (end - self._kept) * self._thin
+        self._kept = end
+
+    def posterior(self) -> Posterior:
+        """The posterior from all draws but the first quarter, in which the chains settle."""
+        kept = slice(self._kept // 4, self._kept)
+        draws = Draws(*(values[:, kept] for values in vars(self._draws).values()))
+        return posterior_of(self._candidates, self.placement.demonstration, self._mixture, draws)
+
+    def _states_going_on(self, before: RunningPosterior) -> list[sampler.PartitionState]:
+        """The states of the chains before, over the present observations and candidates."""
+        _, old, new = np.intersect1d(
+            before.placement.poses, self.placement.poses, return_indices=True
+        )
+        candidate_of_old = self._candidates_on(before)
+        states = []
+        for state, generator in zip(before._states, self._generators, strict=True):
+            partitions = state.partition_of[old]
+            subgoals = candidate_of_old[state.subgoal_of_slot[partitions]]
+            partition_of = np.full(len(self.placement.poses), -1, dtype=np.int64)
+            subgoal_of = partition_of.copy()
+            partition_of[new] = np.where(subgoals >= 0, partitions, -1)
+            subgoal_of[new] = subgoals
+            states.append(sampler.seat(self._mixture, partition_of, subgoal_of, generator))
+        return states
+
+    def _candidates_on(self, before: RunningPosterior) -> npt.NDArray[np.int64]:
+        """(G before,) present index of each candidate before, by its place; -1 for none."""
+        places = before.grid_map.centres_of(before._candidates)
+        index_of_cell = {
+            tuple(cell): index for index, cell in enumerate(self._candidates.tolist())
+        }
+        cells = self.grid_map.cells_of(places).tolist()
+        return np.array([index_of_cell.get(tuple(cell), -1) for cell in cells], dtype=np.int64)
