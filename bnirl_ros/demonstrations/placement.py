@@ -25,11 +25,13 @@ class Placement:
         demonstration: its N observations.
         poses: (N,) index into the recording's poses of each observation: as a recording only
             grows, that tells which observations are the same in a later placement.
+        messages: number of poses and actions that the recording had.
         faults: what did not fit, counted by fault.
     """
 
     demonstration: Demonstration
     poses: npt.NDArray[np.int64]
+    messages: int
     faults: Counter[str]
 
 
@@ -91,7 +93,12 @@ def place(
         last_episode=np.searchsorted(numbers, episode[kept]),
         last_cells=cells[kept],
     )
-    return Placement(demonstration, np.flatnonzero(in_frame)[observed], faults)
+    return Placement(
+        demonstration=demonstration,
+        poses=np.flatnonzero(in_frame)[observed],
+        messages=len(recording.pose_stamps) + len(recording.actions),
+        faults=faults,
+    )
 
 
 def episode_starts(

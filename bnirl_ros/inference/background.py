@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from threading import Condition, Event, Thread
@@ -60,7 +61,7 @@ class BackgroundInference:
         self._changed = False
         self._paused = False
         self._closed = False
-        self._requests: list[Future[Result]] = []
+        self._requests: list[tuple[Future[Result], Callable[[Result], None] | None]] = []
         self._result: Result | None = None
         self._running: RunningPosterior | None = None
         self._stands = False  # the last result was asked for, and nothing has changed since
@@ -102,15 +103,18 @@ class BackgroundInference:
         """Forget the chains; the recorder was cleared."""
         self._update(_forget=True, _changed=True)
 
-    def infer(self) -> Future[Result]:
+    def infer(self, finish: Callable[[Result], None] | None = None) -> Future[Result]:
         """Ask for an inference with fresh chains over all observations so far.
 
-        The future gets the result, or the `InputError` that says why there is none; it is
-        cancelled when this is closed before.
+        The future gets the result, or the exception that says why there is none (an `InputError`
+        for a user's mistake); it is cancelled when this is closed before.
+
+        Args:
+            finish: called with the result, in the thread, before the future gets it.
         """
         request: Future[Result] = Future()
         with self._wake:
-            self._requests.append(request)
+            self._requests.append((request, finish))
             self._wake.notify()
         return request
 
@@ -142,13 +146,13 @@ class BackgroundInference:
             with self._wake:
                 self._wake.wait_for(self._has_work)
                 if self._closed:
-                    for waiting in self._requests:
+                    for waiting, _ in self._requests:
                         waiting.cancel()
                     return
-                request = self._requests.pop(0) if self._requests else None
+                request, finish = self._requests.pop(0) if self._requests else (None, None)
             try:
                 if request:
-                    self._answer(request)
+                    self._answer(request, finish)
                 else:
                     self._publish(self._next_running_result())
                 self.error = ""
@@ -174,23 +178,24 @@ class BackgroundInference:
         recording = self._recorder.snapshot()
         return place(recording, grid_map, settings.moves, self._episode_gap), grid_map, settings
 
-    def _answer(self, request: Future[Result]) -> None:
+    def _answer(self, request: Future[Result], finish: Callable[[Result], None] | None) -> None:
         """Infer with fresh chains."""
         try:
             placement, grid_map, settings = self._place()
             posterior = infer(placement.demonstration, grid_map, settings, stop=self._stop)
+            summary = summarise(posterior, grid_map)
+            result = Result(grid_map, placement, summary, settings.sweeps, posterior, settings)
+            if finish:
+                finish(result)
         except InputError as error:
             self._changed = True  # what is new was taken note of, but not taken in
             request.set_exception(error)
-            return
         except StoppedError:
             request.cancel()
-            return
-        summary = summarise(posterior, grid_map)
-        result = Result(grid_map, placement, summary, settings.sweeps, posterior, settings)
-        self._stands = True
-        self._publish(replace(result, posterior=None))
-        request.set_result(result)
+        else:
+            self._stands = True
+            self._publish(replace(result, posterior=None))
+            request.set_result(result)
 
     def _next_running_result(self) -> Result:
         """Take in what is new, and go on for a round."""

@@ -105,6 +105,21 @@ def summarise(posterior: Posterior, grid_map: GridMap) -> Summary:
     )
 
 
+def nothing_found(grid_map: GridMap) -> Summary:
+    """The summary while there is no observation: no subgoal, anywhere."""
+    return Summary(
+        subgoals=(),
+        visit_sequence=(),
+        observations=np.empty((0, 4), dtype=np.int64),
+        rank_of=np.empty(0, dtype=np.int64),
+        cell_probability=np.zeros(grid_map.free.shape),
+        rhat=None,
+        ess=None,
+        chains=0,
+        draws=0,
+    )
+
+
 def episode_visits(
     demonstration: Demonstration,
     cells: npt.NDArray[np.int64],

@@ -1,0 +1,140 @@
+"""Parameters of a node, declared from tables: type, default, range, description, changeable."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.exceptions import (
+    InvalidParameterTypeException,
+    InvalidParameterValueException,
+    ParameterImmutableException,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from bnirl_ros.errors import InputError
+from bnirl_ros.inference.settings import Limits, Settings, limits_of
+
+
+@dataclass(frozen=True)
+class NodeParameter:
+    """A parameter that is the node's own, not the inference's.
+
+    Attributes:
+        name: its name.
+        default: its value where none is given; also fixes its type.
+        limits: description and range.
+        read_only: whether it can be given at the start only.
+    """
+
+    name: str
+    default: Any
+    limits: Limits
+    read_only: bool = True
+
+
+def declare(node: Node, table: Sequence[NodeParameter]) -> dict[str, Any]:
+    """Declare parameters with type, range and description; returns their values by name.
+
+    Raises:
+        InputError: a value that was given is of another type or out of its range.
+    """
+    return {entry.name: _declared(node, entry) for entry in table}
+
+
+def declare_settings(node: Node, on_change: Callable[[Settings], None]) -> Settings:
+    """Declare every setting of the inference; each can be changed while the node runs.
+
+    A change that gives no valid settings is refused with the reason, and nothing is changed.
+
+    Args:
+        node: the node.
+        on_change: called with the new settings after every change.
+
+    Raises:
+        InputError: as in `declare`.
+    """
+    table = [
+        NodeParameter(field.name, field.default, limits_of(field), read_only=False)
+        for field in fields(Settings)
+    ]
+    names = {entry.name for entry in table}
+    settings = Settings(**declare(node, table))
+
+    def changed(parameters: Sequence[Parameter]) -> Settings:
+        values = {entry.name: node.get_parameter(entry.name).value for entry in table}
+        values.update({p.name: p.value for p in parameters if p.name in names})
+        return replace(settings, **values)
+
+    def check(parameters: Sequence[Parameter]) -> SetParametersResult:
+        try:
+            changed(parameters)
+        except InputError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def apply(parameters: Sequence[Parameter]) -> None:
+        if any(parameter.name in names for parameter in parameters):
+            on_change(changed([]))
+
+    node.add_on_set_parameters_callback(check)
+    node.add_post_set_parameters_callback(apply)
+    return settings
+
+
+def _declared(node: Node, entry: NodeParameter) -> Any:
+    try:
+        value = node.declare_parameter(entry.name, entry.default, _descriptor(entry)).value
+    except InvalidParameterTypeException as error:
+        raise InputError(
+            f"parameter {entry.name}: must be of type {type(entry.default).__name__}, such as "
+            f"{entry.default!r}"
+        ) from error
+    except (InvalidParameterValueException, ParameterImmutableException) as error:
+        raise InputError(f"parameter {entry.name}: {error}") from error
+    fault = entry.limits.fault(entry.name, value)
+    if fault:
+        raise InputError(f"parameter {fault}")
+    return value
+
+
+def _descriptor(entry: NodeParameter) -> ParameterDescriptor:
+    limits = entry.limits
+    descriptor = ParameterDescriptor(
+        description=limits.description,
+        additional_constraints=(
+            f"one of {', '.join(map(str, limits.choices))}"
+            if limits.choices
+            else limits.range_in_words()
+        ),
+        read_only=entry.read_only,
+    )
+    lowest, highest = max(limits.lowest, limits.above), min(limits.highest, limits.below)
+    if isinstance(entry.default, float) and math.isfinite(max(lowest, -highest)):
+        descriptor.floating_point_range = [
+            FloatingPointRange(
+                from_value=max(lowest, -_LARGEST_FLOAT), to_value=min(highest, _LARGEST_FLOAT)
+            )
+        ]
+    elif isinstance(entry.default, int) and math.isfinite(max(lowest, -highest)):
+        descriptor.integer_range = [
+            IntegerRange(
+                from_value=int(max(lowest, -_LARGEST_INTEGER)),
+                to_value=int(min(highest, _LARGEST_INTEGER)),
+                step=1,
+            )
+        ]
+    return descriptor
+
+
+_LARGEST_FLOAT = 1.7976931348623157e308
+_LARGEST_INTEGER = 2**63 - 1

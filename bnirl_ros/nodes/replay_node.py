@@ -1,0 +1,262 @@
+"""The node that plays a recorded demonstration onto its topics, and loses nothing on the way."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from rclpy.duration import Duration
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.utilities import remove_ros_args
+
+from bnirl_ros.bags.qos import LATCHED, QosProfile
+from bnirl_ros.bags.reader import Bag, RawMessage, Topic
+from bnirl_ros.errors import InputError
+from bnirl_ros.maps import load_map
+from bnirl_ros.nodes.conversion import message_class, to_ros
+from bnirl_ros.nodes.running import run
+from bnirl_ros.views.belief import map_message
+
+_DEPTH = 1000  # of a reliable publisher at least, so that one round of messages fits
+_ROUND = 250  # messages sent before all of them must be acknowledged
+_LOOK_PERIOD = 0.05  # [s] between two looks at whether to stop
+_STUCK_AFTER = 10.0  # [s] without acknowledgement after which a subscriber is given up
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to play.
+
+    Attributes:
+        bag: rosbag2 folder or MCAP file.
+        rate: factor on the recorded pace, above 0; None: as fast as subscribers acknowledge.
+        grid_map: a map file to publish on /map first, for a bag that has none; None: none.
+        patience: how long to wait for a subscriber of every topic [s].
+    """
+
+    bag: Path
+    rate: float | None
+    grid_map: Path | None
+    patience: float
+
+
+class ReplayNode(Node):
+    """Publishes a bag's messages as they were recorded: bytes, order, pace and QoS."""
+
+    def __init__(self, bag: Bag) -> None:
+        """Announce the bag's topics; those of a type that isn't installed are left out."""
+        super().__init__("replay_node")
+        self.sent: Counter[str] = Counter()
+        self.skipped: dict[str, str] = {}
+        self._topic_publishers: dict[str, Any] = {}
+        self._latched: set[str] = set()
+        for topic in bag.topics():
+            self._announce(topic)
+
+    def wait_for_subscribers(self, patience: float) -> None:
+        """Wait until every topic has a subscriber; says for whom, and after a while goes on."""
+        deadline = time.monotonic() + patience
+        tell_at = time.monotonic() + 1.0
+        while missing := self._without_subscriber():
+            if time.monotonic() > deadline:
+                self.get_logger().warning(
+                    f"no subscriber of {', '.join(missing)} after {patience:g} s; goes on without"
+                )
+                return
+            if time.monotonic() > tell_at:
+                self.get_logger().info(f"waits for a subscriber of {', '.join(missing)}")
+                tell_at = deadline
+            _rest(_LOOK_PERIOD)
+
+    def publish_map(self, path: Path) -> None:
+        """Publish a map file on /map, latched.
+
+        Raises:
+            InputError: the file cannot be used, or the bag has a map itself.
+        """
+        if "/map" in self._topic_publishers:
+            raise InputError(f"{path}: the bag has a topic /map already; leave out --map")
+        view = map_message(load_map(path), time.time_ns())
+        self._announce(Topic("/map", view.TYPE, 1, (LATCHED,)))
+        self._topic_publishers["/map"].publish(to_ros(view))
+        self.sent["/map"] += 1
+
+    def play(self, messages: Iterable[RawMessage], rate: float | None) -> None:
+        """Publish messages in their order.
+
+        With a rate, each is sent at its recorded time since the first one over the rate; without,
+        as soon as the subscribers have acknowledged those before.
+        """
+        start: tuple[float, int] | None = None
+        for number, message in enumerate(messages, start=1):
+            publisher = self._topic_publishers.get(message.topic)
+            if publisher is None:
+                continue
+            if start is None:
+                start = (time.monotonic(), message.log_time)
+            if rate is not None:
+                due = start[0] + (message.log_time - start[1]) / 1e9 / rate
+                while (left := due - time.monotonic()) > 0.0:
+                    _rest(min(left, _LOOK_PERIOD))
+            publisher.publish(message.data)
+            self.sent[message.topic] += 1
+            if message.topic in self._latched or (rate is None and number % _ROUND == 0):
+                self.wait_until_acknowledged()
+        self.wait_until_acknowledged()
+
+    def wait_until_acknowledged(self) -> None:
+        """Wait until every reliable subscriber has what was sent, unless one doesn't answer."""
+        for topic, publisher in self._topic_publishers.items():
+            deadline = time.monotonic() + _STUCK_AFTER
+            while not publisher.wait_for_all_acked(Duration(seconds=_LOOK_PERIOD)):
+                _rest(0.0)
+                if time.monotonic() > deadline:
+                    self.get_logger().warning(
+                        f"a subscriber of {topic} doesn't acknowledge; goes on",
+                        throttle_duration_sec=10.0,
+                    )
+                    break
+
+    def report(self) -> str:
+        """A line on what was sent, and what was not and why."""
+        parts = [f"{topic} {count}" for topic, count in sorted(self.sent.items())]
+        parts += [f"{topic} not sent ({why})" for topic, why in sorted(self.skipped.items())]
+        return f"sent {self.sent.total()} messages: {', '.join(parts) or 'none'}"
+
+    def _announce(self, topic: Topic) -> None:
+        if topic.encoding != "cdr":
+            self.skipped[topic.name] = f"encoded as {topic.encoding or 'nothing'}, not cdr"
+            return
+        try:
+            kind = message_class(topic.type_name)
+        except (ImportError, ValueError):
+            self.skipped[topic.name] = f"type {topic.type_name or 'unknown'} isn't installed"
+            return
+        recorded = topic.qos[0] if topic.qos else QosProfile()
+        if recorded.durability == LATCHED.durability:
+            self._latched.add(topic.name)
+        elif recorded.reliability != "best_effort":
+            recorded = replace(recorded, depth=max(recorded.depth, _DEPTH))
+        self._topic_publishers[topic.name] = self.create_publisher(
+            kind, topic.name, qos_profile(recorded)
+        )
+
+    def _without_subscriber(self) -> list[str]:
+        return [
+            topic
+            for topic, publisher in self._topic_publishers.items()
+            if publisher.get_subscription_count() == 0
+        ]
+
+
+def qos_profile(recorded: QosProfile) -> QoSProfile:
+    """rclpy's form of a recorded profile; what it leaves open is as ROS does by default."""
+    return QoSProfile(
+        depth=recorded.depth or 10,
+        history=HistoryPolicy.KEEP_ALL
+        if recorded.history == "keep_all"
+        else HistoryPolicy.KEEP_LAST,
+        reliability=ReliabilityPolicy.BEST_EFFORT
+        if recorded.reliability == "best_effort"
+        else ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL
+        if recorded.durability == "transient_local"
+        else DurabilityPolicy.VOLATILE,
+    )
+
+
+def replay(options: Options) -> int:
+    """Play a bag; returns the exit status: 1 if the bag is damaged, though played as far as it is.
+
+    Raises:
+        InputError: the bag or the map cannot be used.
+    """
+    bag = Bag(options.bag)
+    node = ReplayNode(bag)
+    log = node.get_logger()
+    try:
+        for warning in bag.warnings:
+            log.warning(warning)
+        if options.grid_map:
+            node.publish_map(options.grid_map)
+        for topic, why in node.skipped.items():
+            log.warning(f"{topic} is not sent: {why}")
+        node.wait_for_subscribers(options.patience)
+        node.play(bag.messages(), options.rate)
+        if bag.damage:
+            raise InputError(bag.damage)
+        return 0
+    finally:
+        print(node.report(), flush=True)
+        node.destroy_node()
+
+
+def parse(arguments: Sequence[str]) -> Options:
+    """The options on a command line without ROS arguments; wrong ones end with status 2."""
+    parser = argparse.ArgumentParser(
+        prog="replay_node", description="Play a recorded demonstration onto its topics."
+    )
+    add_arguments(parser)
+    return options_of(vars(parser.parse_args(arguments)))
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the replay's arguments to a parser."""
+    parser.add_argument("bag", metavar="BAG", type=Path, help="rosbag2 folder or .mcap file")
+    pace = parser.add_mutually_exclusive_group()
+    pace.add_argument(
+        "-r",
+        "--rate",
+        type=_positive,
+        default=1.0,
+        help="factor on the recorded pace (%(default)s)",
+    )
+    pace.add_argument("--fast", action="store_true", help="as fast as the subscribers acknowledge")
+    parser.add_argument("--map", type=Path, help="map file to publish on /map for a bag without")
+    parser.add_argument(
+        "--wait",
+        type=_positive,
+        default=30.0,
+        metavar="SECONDS",
+        help="how long to wait for a subscriber of every topic (%(default)s)",
+    )
+
+
+def options_of(values: Mapping[str, Any]) -> Options:
+    """The options that parsed arguments mean."""
+    rate = None if values["fast"] else values["rate"]
+    return Options(values["bag"], rate, values["map"], values["wait"])
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"must be above 0, not {text}")
+    return value
+
+
+def _rest(seconds: float) -> None:
+    """Sleep, unless the process was told to end."""
+    if not rclpy.ok():
+        raise ExternalShutdownException
+    time.sleep(seconds)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the node until the bag's end, or until it is stopped; returns the exit status."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    options = parse(remove_ros_args(["replay_node", *given])[1:])
+    return run("replay_node", lambda: replay(options), given)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
