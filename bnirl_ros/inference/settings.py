@@ -34,6 +34,8 @@ class Limits:
             if value in self.choices:
                 return None
             return f"{name} must be one of {', '.join(map(str, self.choices))}, not {value}"
+        if isinstance(value, str):
+            return None
         if isinstance(value, float) and not math.isfinite(value):
             return f"{name} must be a finite number, not {value}"
         if not max(self.lowest, self.above) <= value <= min(self.highest, self.below) or (

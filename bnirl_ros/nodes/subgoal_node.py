@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -116,7 +117,9 @@ class SubgoalNode(Node):
             for name, type_name in OUTPUTS.items()
         }
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self.create_service(Trigger, "~/infer", self._on_infer)
+        # In a group of its own: in the node's, everything else would wait until it is answered.
+        answered_later = ReentrantCallbackGroup()
+        self.create_service(Trigger, "~/infer", self._on_infer, callback_group=answered_later)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
         self.create_timer(_LOOK_PERIOD, self._look)
