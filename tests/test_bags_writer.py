@@ -193,7 +193,7 @@ def test_a_bag_is_overwritten_only_when_asked(tmp_path: File) -> None:
     write_example(folder)
     (folder / "README.md").write_text("whose data these are")
     (folder / "example_1.mcap").write_text("a split of the bag before")
-    with pytest.raises(InputError, match="exists already: choose another name"):
+    with pytest.raises(InputError, match="exists already; choose another name"):
         write_example(folder)
     write_example(folder, overwrite=True)
     assert sorted(path.name for path in folder.iterdir()) == [

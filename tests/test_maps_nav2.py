@@ -160,7 +160,7 @@ def refusal(path: Path) -> str:
         read_nav2_map(path)
     sentence = str(caught.value)
     assert sentence.startswith(f"{path}: ")
-    assert sentence.endswith(".")
+    assert not sentence.endswith(".")
     assert "\n" not in sentence
     return sentence
 

@@ -47,7 +47,7 @@ def test_a_drawing_that_is_no_map_is_refused_with_its_place(tmp_path, content, s
     sentence = str(caught.value)
     assert sentence.startswith(f"{path}: ")
     assert says in sentence
-    assert sentence.endswith(".")
+    assert not sentence.endswith(".")
 
 
 def test_a_missing_file(tmp_path):
@@ -71,5 +71,5 @@ def test_load_map_reads_a_nav2_map_by_its_suffix(tmp_path, suffix):
 
 
 def test_load_map_refuses_another_suffix(tmp_path):
-    with pytest.raises(InputError, match=r"map\.pgm: a map is .*; name one of them\.$"):
+    with pytest.raises(InputError, match=r"map\.pgm: a map is .*; name one of them$"):
         load_map(tmp_path / "map.pgm")

@@ -49,6 +49,6 @@ def decode(type_name: str, data: bytes) -> object:
         return store.deserialize_cdr(data, name)
     except (SerdeError, struct.error, ValueError, IndexError, OverflowError) as fault:
         raise InputError(
-            f"These {len(data)} bytes are no {name} in CDR: record the topic again, or leave it "
-            f"out ({fault})."
+            f"{len(data)} bytes are no {name} in CDR ({fault}); record the topic again, or leave "
+            "it out"
         ) from fault

@@ -121,8 +121,8 @@ def _text(name: str) -> str:
     path = _schema_folder() / match[1] / "msg" / f"{match[2]}.msg" if match else None
     if path is None or not path.is_file():
         raise InputError(
-            f"The message type {name!r} is unknown to bnirl_ros: leave its topic out; the known "
-            f"types are {', '.join(known_types())}."
+            f"message type {name!r}: is unknown to bnirl_ros; leave its topic out, or take one of "
+            f"{', '.join(known_types())}"
         )
     return path.read_text(encoding="utf-8")
 

@@ -71,15 +71,14 @@ class BagWriter:
         try:
             if not self._overwrite and self._folder.exists() and any(self._folder.iterdir()):
                 raise InputError(
-                    f"{self._folder} exists already: choose another name, or allow it to be "
-                    "overwritten."
+                    f"{self._folder}: exists already; choose another name, or allow it to be "
+                    "overwritten"
                 )
             self._folder.mkdir(parents=True, exist_ok=True)
             self._stream = self._partial.open("wb")
         except OSError as fault:
             raise InputError(
-                f"The bag {self._folder} cannot be written: {fault.strerror}; choose a folder "
-                "that can."
+                f"{self._folder}: cannot be written ({fault.strerror}); choose a folder that can"
             ) from fault
         self._writer = Writer(self._stream, chunk_size=CHUNK_SIZE)
         self._writer.start(profile="ros2", library=f"bnirl_ros {__version__}")

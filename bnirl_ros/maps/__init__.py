@@ -33,6 +33,6 @@ def load_map(path: str | Path) -> GridMap:
     reader = _READERS.get(Path(path).suffix.lower())
     if reader is None:
         raise InputError(
-            f"{path}: a map is a Nav2 map file (.yaml) or a text grid (.txt); name one of them."
+            f"{path}: a map is a Nav2 map file (.yaml) or a text grid (.txt); name one of them"
         )
     return reader(path)

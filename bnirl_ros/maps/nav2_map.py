@@ -85,19 +85,19 @@ def _read_settings(path: Path) -> _MapFile:
         content = yaml.safe_load(path.read_bytes())
     except OSError as error:
         raise InputError(
-            f"{path}: the map file cannot be read ({error.strerror}); check the path."
+            f"{path}: the map file cannot be read ({error.strerror}); check the path"
         ) from None
     # PyYAML lets ValueError through for impossible dates, RecursionError for deep nesting.
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         place = f" at line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         raise InputError(
-            f"{path}: this is not valid YAML{place}; name the .yaml file that map_saver wrote."
+            f"{path}: this is not valid YAML{place}; name the .yaml file that map_saver wrote"
         ) from None
     if not isinstance(content, Mapping):
         raise InputError(
             f"{path}: this YAML holds no keys; a Nav2 map has image, resolution, origin, negate,"
-            " occupied_thresh and free_thresh."
+            " occupied_thresh and free_thresh"
         )
     return _MapFile(
         image=_image_path(content, path),
@@ -112,7 +112,7 @@ def _read_settings(path: Path) -> _MapFile:
 
 def _value(content: Mapping[str, Any], key: str, path: Path) -> Any:
     if key not in content:
-        raise InputError(f"{path}: the key '{key}' is missing; add it as map_saver writes it.")
+        raise InputError(f"{path}: the key '{key}' is missing; add it as map_saver writes it")
     return content[key]
 
 
@@ -130,7 +130,7 @@ def _number(content: Mapping[str, Any], key: str, path: Path) -> float:
     value = _value(content, key, path)
     number = _as_number(value)
     if math.isnan(number):
-        raise InputError(f"{path}: '{key}' is {value!r}; it must be a finite number.")
+        raise InputError(f"{path}: '{key}' is {value!r}; it must be a finite number")
     return number
 
 
@@ -139,7 +139,7 @@ def _origin(content: Mapping[str, Any], path: Path) -> tuple[float, float, float
     numbers = [_as_number(item) for item in value] if isinstance(value, list) else []
     if len(numbers) != 3 or any(math.isnan(number) for number in numbers):
         raise InputError(
-            f"{path}: 'origin' is {value!r}; it must be three finite numbers, [x, y, yaw]."
+            f"{path}: 'origin' is {value!r}; it must be three finite numbers, [x, y, yaw]"
         )
     x, y, yaw = numbers
     return x, y, yaw
@@ -149,14 +149,14 @@ def _mode(content: Mapping[str, Any], path: Path) -> str:
     value = content.get("mode", "trinary")
     mode = str(value).lower()
     if mode not in _MODES:
-        raise InputError(f"{path}: 'mode' is {value!r}; it must be one of {', '.join(_MODES)}.")
+        raise InputError(f"{path}: 'mode' is {value!r}; it must be one of {', '.join(_MODES)}")
     return mode
 
 
 def _image_path(content: Mapping[str, Any], path: Path) -> Path:
     value = _value(content, "image", path)
     if not isinstance(value, str) or not value:
-        raise InputError(f"{path}: 'image' is {value!r}; it must be the path of an image.")
+        raise InputError(f"{path}: 'image' is {value!r}; it must be the path of an image")
     return path.parent / value
 
 
@@ -176,16 +176,16 @@ def _read_pixels(settings: _MapFile, path: Path) -> _Pixels:
         raise
     except FileNotFoundError:
         raise InputError(
-            f"{path}: there is no image at {settings.image}; put it there or correct 'image'."
+            f"{path}: there is no image at {settings.image}; put it there or correct 'image'"
         ) from None
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
         raise InputError(
-            f"{path}: the image {settings.image} is too large; crop it or lower its resolution."
+            f"{path}: the image {settings.image} is too large; crop it or lower its resolution"
         ) from None
     # All of these are ways in which Pillow says that an image is broken.
     except (OSError, SyntaxError, ValueError, EOFError, IndexError, struct.error):
         raise InputError(
-            f"{path}: the image {settings.image} cannot be read; save it again as PGM, PNG or BMP."
+            f"{path}: the image {settings.image} cannot be read; save it again as PGM, PNG or BMP"
         ) from None
 
 

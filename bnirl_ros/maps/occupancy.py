@@ -51,13 +51,13 @@ def map_from_occupancy(
     if occupancy.size != width * height:
         raise InputError(
             f"{source}: the map says {width} x {height} cells but has {occupancy.size} values;"
-            " publish or save it again."
+            " publish or save it again"
         )
     free = ((occupancy >= 0) & (occupancy < OCCUPIED_FROM)).reshape(height, width)
     if not free.any():
         raise InputError(
             f"{source}: no cell of the map is free (occupancy 0-49);"
-            " check its thresholds and whether it is inverted."
+            " check its thresholds and whether it is inverted"
         )
     return GridMap(free, float(resolution), origin, frame_id)
 
@@ -76,22 +76,21 @@ def check_geometry(
     """
     if width <= 0 or height <= 0:
         raise InputError(
-            f"{source}: the map has {width} x {height} cells; give one with at least one cell."
+            f"{source}: the map has {width} x {height} cells; give one with at least one cell"
         )
     if width * height > MAX_CELLS:
         raise InputError(
             f"{source}: the map has {width} x {height} cells, more than the {MAX_CELLS} that are"
-            " accepted; crop it or lower its resolution."
+            " accepted; crop it or lower its resolution"
         )
     if not (math.isfinite(resolution) and resolution > 0):
         raise InputError(
             f"{source}: the map's resolution is {resolution} m;"
-            " it must be a positive number of metres."
+            " it must be a positive number of metres"
         )
     if not all(math.isfinite(value) for value in origin):
         raise InputError(
-            f"{source}: the map's origin (x, y, yaw) is {tuple(origin)};"
-            " it must be finite numbers."
+            f"{source}: the map's origin (x, y, yaw) is {tuple(origin)}; it must be finite numbers"
         )
 
 
@@ -112,7 +111,7 @@ def yaw_of(x: float, y: float, z: float, w: float, source: str) -> float:
     """
     if not all(math.isfinite(value) for value in (x, y, z, w)):
         raise InputError(
-            f"{source}: the orientation (x, y, z, w) is {(x, y, z, w)}; it must be finite numbers."
+            f"{source}: the orientation (x, y, z, w) is {(x, y, z, w)}; it must be finite numbers"
         )
     # Neither argument divides by the norm, so that any length will do; atan2(0, 0) is 0.
     return math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)

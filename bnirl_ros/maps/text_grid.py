@@ -27,11 +27,11 @@ def read_text_grid(path: str | Path) -> GridMap:
         text = Path(path).read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(
-            f"{path}: this is no text file; draw the map with '#' for blocked and '.' for free."
+            f"{path}: this is no text file; draw the map with '#' for blocked and '.' for free"
         ) from None
     except OSError as error:
         raise InputError(
-            f"{path}: the map cannot be read ({error.strerror}); check the path."
+            f"{path}: the map cannot be read ({error.strerror}); check the path"
         ) from None
     # str.splitlines would also split at form feeds and the like and miscount the lines.
     lines = text.rstrip("\n").split("\n")
@@ -41,12 +41,12 @@ def read_text_grid(path: str | Path) -> GridMap:
             if character not in _OCCUPANCY:
                 raise InputError(
                     f"{path}: line {number}, column {column} is {character!r};"
-                    " write '#' for a blocked cell and '.' for a free one."
+                    " write '#' for a blocked cell and '.' for a free one"
                 )
         if len(line) != width:
             raise InputError(
                 f"{path}: line {number} ends after column {len(line)}, line 1 after column"
-                f" {width}; make all lines equally long."
+                f" {width}; make all lines equally long"
             )
     occupancy = np.array([[_OCCUPANCY[character] for character in line] for line in lines[::-1]])
     return map_from_occupancy(
