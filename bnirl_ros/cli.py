@@ -131,7 +131,7 @@ def _infer(options: argparse.Namespace) -> int:
     print(convergence(summary))
     print(f"Written: {', '.join(str(file) for file in written)}")
     if damage:
-        raise InputError(f"{damage} The results are from what could be read")
+        raise InputError(f"{damage}; the results are from what could be read")
     return 0
 
 

@@ -192,8 +192,8 @@ def test_a_file_cut_off_gives_all_before_the_cut(tmp_path: Path, name: str) -> N
         found = numbers(bag.messages())
         assert found == list(range(len(found)))
         assert bag.damage is not None
-        assert bag.damage.startswith(f"{tmp_path / 'damaged.mcap'} is damaged")
-        assert f"{len(found)} messages could be read." in bag.damage
+        assert bag.damage.startswith(f"{tmp_path / 'damaged.mcap'}: is damaged")
+        assert bag.damage.endswith(f"; {len(found)} messages could be read")
         assert sum(topic.messages for topic in bag.topics()) == len(found)
         recovered.append(len(found))
     assert recovered == sorted(recovered)
@@ -241,6 +241,28 @@ def test_a_chunk_that_claims_absurd_sizes_is_refused(tmp_path: Path) -> None:
     assert "claims to unpack to 1099511627776 bytes" in bag.damage
 
 
+def test_a_chunk_that_claims_more_data_than_it_has_is_read(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "whole.mcap", list(range(300)))
+    whole = bytearray((tmp_path / "whole.mcap").read_bytes())
+    size = whole.index(b"zstd") + 4
+    whole[size + 7] = 255  # more than any stream can have
+    bag = damaged(tmp_path, bytes(whole))
+    assert numbers(bag.messages()) == list(range(300))
+    assert bag.damage is not None
+    assert "a chunk breaks off" in bag.damage
+
+
+def test_a_message_too_short_does_not_cost_the_next(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "whole.mcap", list(range(300)), **LAYOUTS["no chunks"])
+    whole = (tmp_path / "whole.mcap").read_bytes()
+    place = whole.index((150).to_bytes(4, "little") * 25) - 22 - 9
+    short = b"\x05" + (21).to_bytes(8, "little") + bytes(21)
+    bag = damaged(tmp_path, whole[:place] + short + whole[place:])
+    assert numbers(bag.messages()) == list(range(300))
+    assert bag.damage is not None
+    assert f"damaged at byte {place} (a message is too short)" in bag.damage
+
+
 def test_random_damage_never_raises(tmp_path: Path) -> None:
     generator = random.Random(3)
     for name in ("all", "small chunks", "lz4", "no chunks"):
@@ -253,7 +275,7 @@ def test_random_damage_never_raises(tmp_path: Path) -> None:
             bag = damaged(tmp_path, bytes(data))
             bag.topics()
             assert sum(1 for _ in bag.messages()) <= 110
-            assert bag.damage is None or bag.damage.endswith("messages could be read.")
+            assert bag.damage is None or bag.damage.endswith("messages could be read")
 
 
 def test_a_bad_file_of_a_split_bag_does_not_cost_the_others(tmp_path: Path) -> None:
@@ -261,7 +283,7 @@ def test_a_bad_file_of_a_split_bag_does_not_cost_the_others(tmp_path: Path) -> N
     (tmp_path / "bag_1.mcap").touch()
     bag = Bag(tmp_path)
     assert numbers(bag.messages()) == [0, 1]
-    assert bag.damage == f"{tmp_path / 'bag_1.mcap'} is empty: record it again."
+    assert bag.damage == f"{tmp_path / 'bag_1.mcap'}: is empty; record it again"
 
 
 # No bag at all
@@ -270,8 +292,8 @@ def test_a_bad_file_of_a_split_bag_does_not_cost_the_others(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("content", "problem"),
     [
-        (b"", "is empty: record it again"),
-        (b"episode,x,y,action\n", "is no MCAP file"),
+        (b"", "is empty; record it again"),
+        (b"episode,x,y,action\n", "is no MCAP file; name a rosbag2 folder"),
         (b"\x28\xb5\x2f\xfd1234", "unpack it with `zstd -d`"),
         (b"SQLite format 3\0rest", "convert it with `ros2 bag convert`"),
     ],
@@ -283,17 +305,18 @@ def test_what_is_no_mcap_file_is_said_in_words(
     path.write_bytes(content)
     with pytest.raises(InputError) as caught:
         Bag(path)
-    assert str(caught.value).startswith(str(path))
+    assert str(caught.value).startswith(f"{path}: ")
+    assert not str(caught.value).endswith(".")
     assert problem in str(caught.value)
 
 
 def test_a_missing_bag_is_said_in_words(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"nowhere does not exist: name a rosbag2 folder"):
+    with pytest.raises(InputError, match=r"nowhere: does not exist; name a rosbag2 folder"):
         Bag(tmp_path / "nowhere")
 
 
 def test_a_folder_without_bags_is_said_in_words(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"holds no \.mcap file"):
+    with pytest.raises(InputError, match=r": holds no \.mcap file; .*`$"):
         Bag(tmp_path)
 
 

@@ -5,29 +5,22 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import IO, NamedTuple
+
+from mcap.records import Channel, Chunk, Footer, Message, Schema, Statistics
 
 from bnirl_ros.bags.definitions import full_type_name
 from bnirl_ros.bags.qos import QosProfile, parse_yaml, qos_from_yaml
 from bnirl_ros.bags.records import (
-    CHUNK_HEAD,
-    FRAME,
-    MAGIC,
-    MESSAGE_HEAD,
-    Channel,
     Contents,
     DamageError,
-    Opcode,
-    Schema,
-    Statistics,
-    check_frame,
     contents_of,
     contents_of_chunk,
-    message_time,
-    parse_channel,
-    parse_schema,
-    parse_statistics,
+    frames_in,
+    has_magic,
+    head_at,
 )
 from bnirl_ros.errors import InputError
 
@@ -113,7 +106,7 @@ class Bag:
         ask again after reading.
         """
         damages = [file.damage for file in self._files if file.damage is not None]
-        return " ".join(self._unread + damages) or None
+        return "; ".join(self._unread + damages) or None
 
     def topics(self) -> list[Topic]:
         """The topics by name, those without messages among them."""
@@ -137,15 +130,15 @@ class Bag:
         wanted = None if topics is None else frozenset(topics)
         # What lies in the bag's pieces is merged; a piece is read only when its time comes.
         waiting = sorted(
-            (piece.start, file_number, piece_number)
+            (piece.time, file_number, piece_number)
             for file_number, file in enumerate(self._files)
             for piece_number, piece in enumerate(file.pieces)
         )
         for file in self._files:
             file.messages_read = 0
         merging: list[tuple[int, int, int, int, list[RawMessage]]] = []
-        for start, file_number, piece_number in waiting:
-            yield from _merged(merging, until=start)
+        for time, file_number, piece_number in waiting:
+            yield from _merged(merging, until=time)
             file = self._files[file_number]
             messages = file.messages_of(file.pieces[piece_number], wanted)
             if messages:
@@ -159,7 +152,7 @@ class Bag:
             return [path]
         if not path.is_dir():
             raise InputError(
-                f"{path} does not exist: name a rosbag2 folder or an .mcap file that does."
+                f"{path}: does not exist; name a rosbag2 folder or an .mcap file that does"
             )
         here = sorted(path.glob("*.mcap"))
         listed, warning = _listed_files(path)
@@ -167,10 +160,10 @@ class Bag:
             return listed
         if not here:
             raise InputError(
-                f"The folder {path} holds no .mcap file: name a bag recorded with `-s mcap`, or "
-                "convert one with `ros2 bag convert`."
+                f"{path}: holds no .mcap file; name a bag recorded with `-s mcap`, or convert one "
+                "with `ros2 bag convert`"
             )
-        self.warnings.append(f"{warning}: its .mcap files are read in the order of their names.")
+        self.warnings.append(f"{warning}; its .mcap files are read in the order of their names")
         return here
 
 
@@ -185,13 +178,13 @@ def _listed_files(folder: Path) -> tuple[list[Path], str | None]:
         listed = [file if file.exists() else folder / file.name for file in listed]
         missing = [file.name for file in listed if not file.is_file()]
     except (OSError, ValueError):
-        return [], f"{folder} has no metadata.yaml that can be read"
+        return [], f"{folder}: has no metadata.yaml that can be read"
     except (TypeError, KeyError):
-        return [], f"{metadata} does not say which files belong to the bag"
+        return [], f"{metadata}: does not say which files belong to the bag"
     if missing:
-        return [], f"{metadata} names {', '.join(missing)}, which is not there"
+        return [], f"{metadata}: names {', '.join(missing)}, which is not there"
     if not listed:
-        return [], f"{metadata} names no files"
+        return [], f"{metadata}: names no files"
     return listed, None
 
 
@@ -228,12 +221,16 @@ def _merged(
 class _Piece:
     """A stretch of a file that holds messages: a chunk, or a run of records outside chunks.
 
-    `offset` and `length` [bytes] cover whole records; `start` is the earliest log time [ns].
+    Attributes:
+        offset: the first byte, where damage is reported.
+        start, end: of the bytes to read: the content of the chunk's record, or whole records.
+        time: the earliest log time [ns].
     """
 
     offset: int
-    length: int
     start: int
+    end: int
+    time: int
     is_chunk: bool
 
 
@@ -256,12 +253,14 @@ class _File:
     def __post_init__(self) -> None:
         try:
             with self.path.open("rb") as stream:
-                _check_magic(self.path, stream.read(len(_SQLITE_MAGIC)))
+                if not has_magic(stream):
+                    stream.seek(0)
+                    raise _refusal(self.path, stream.read(len(_SQLITE_MAGIC)))
                 statistics = self._scan(stream)
         except OSError as fault:
             raise _unreadable(self.path, fault) from fault
         if statistics is not None and self._defines_all(statistics):
-            self.counts = statistics.messages
+            self.counts = statistics.channel_message_counts
         else:
             # No summary, or one that leaves things out: only the chunks themselves know them.
             self._read_definitions()
@@ -273,8 +272,8 @@ class _File:
         offset, reason = min(self.faults.items())
         places = "" if len(self.faults) == 1 else f"in {len(self.faults)} places, the first "
         return (
-            f"{self.path} is damaged {places}at byte {offset}: {reason}; {self.messages_read} "
-            "messages could be read."
+            f"{self.path}: is damaged {places}at byte {offset} ({reason}); {self.messages_read} "
+            "messages could be read"
         )
 
     def type_of(self, channel: Channel) -> str:
@@ -287,7 +286,7 @@ class _File:
             type_name=self.type_of(channel),
             messages=self.counts.get(channel.id, 0),
             qos=qos_from_yaml(channel.metadata.get("offered_qos_profiles", "")),
-            encoding=channel.encoding,
+            encoding=channel.message_encoding,
             type_hash=channel.metadata.get("topic_type_hash", ""),
         )
 
@@ -308,27 +307,25 @@ class _File:
             for message in contents.messages
             if message.channel_id in kinds
         ]
-        messages.sort(key=lambda message: message.log_time)
+        messages.sort(key=attrgetter("log_time"))
         return messages
 
     def _contents_of(self, piece: _Piece) -> Contents:
         try:
             with self.path.open("rb") as stream:
-                stream.seek(piece.offset)
-                data = stream.read(piece.length)
+                stream.seek(piece.start)
+                data = stream.read(piece.end - piece.start)
         except OSError as fault:
             contents = Contents(damage=f"it cannot be read ({fault.strerror})")
         else:
-            contents = (
-                contents_of_chunk(data[FRAME.size :]) if piece.is_chunk else contents_of(data)
-            )
+            contents = contents_of_chunk(data) if piece.is_chunk else contents_of(data)
         if contents.damage is not None:
             self.faults.setdefault(piece.offset, contents.damage)
         return contents
 
     def _defines_all(self, statistics: Statistics) -> bool:
         used = {channel.schema_id for channel in self.channels.values()} - {0}
-        return len(self.channels) >= statistics.channels and used <= self.schemas.keys()
+        return len(self.channels) >= statistics.channel_count and used <= self.schemas.keys()
 
     def _read_definitions(self) -> None:
         self.counts = {}
@@ -342,85 +339,54 @@ class _File:
 
     def _scan(self, stream: IO[bytes]) -> Statistics | None:
         """Walk the file's records without reading the chunks; also the summary is records."""
-        size = stream.seek(0, 2)
-        offset = len(MAGIC)
+        begin, size = stream.tell(), stream.seek(0, 2)
         run = _Run(self.pieces)
         statistics = None
-        opcode = 0
-        while opcode != Opcode.FOOTER:
+        for frame in frames_in(stream, begin, size):
+            if frame.damage is not None:
+                self.faults[frame.offset] = frame.damage
             try:
-                opcode, end = self._frame_at(stream, offset, size)
+                record = head_at(stream, frame)
             except DamageError as damage:
-                self.faults[offset] = str(damage)
+                # The records after this one can still be read, unless it breaks off.
+                self.faults.setdefault(frame.offset, str(damage))
+                continue
+            if isinstance(record, Footer):
+                if not has_magic(stream):
+                    self.faults[frame.offset] = "the file does not end as MCAP files do"
                 break
-            try:
-                if opcode == Opcode.MESSAGE:
-                    run.add(offset, end, message_time(stream.read(MESSAGE_HEAD.size)))
-                elif opcode == Opcode.STATISTICS:
-                    statistics = parse_statistics(_content(stream, offset, end))
-                elif opcode == Opcode.SCHEMA:
-                    schema = parse_schema(_content(stream, offset, end))
-                    self.schemas[schema.id] = schema
-                elif opcode == Opcode.CHANNEL:
-                    channel = parse_channel(_content(stream, offset, end))
-                    self.channels[channel.id] = channel
-                elif opcode == Opcode.FOOTER:
-                    _check_end(stream, end)
-            except DamageError as damage:
-                # The frame is whole, so the records after this one can still be read.
-                self.faults[offset] = str(damage)
-            offset = end
-        run.end()
+            if isinstance(record, Message):
+                run.add(frame.offset, frame.end, record.log_time)
+            elif isinstance(record, Chunk):
+                place = (frame.offset, frame.start, frame.end)
+                self.pieces.append(_Piece(*place, record.message_start_time, is_chunk=True))
+            elif isinstance(record, Schema):
+                self.schemas[record.id] = record
+            elif isinstance(record, Channel):
+                self.channels[record.id] = record
+            elif isinstance(record, Statistics):
+                statistics = record
+        run.finish()
         return None if self.faults else statistics
 
-    def _frame_at(self, stream: IO[bytes], offset: int, size: int) -> tuple[int, int]:
-        """Opcode and end of the record at the offset; a chunk is noted also if it breaks off."""
-        stream.seek(offset)
-        frame = stream.read(FRAME.size)
-        if len(frame) < FRAME.size:
-            raise DamageError("the file breaks off there, as when a recording was interrupted")
-        opcode, length = FRAME.unpack(frame)
-        body = offset + FRAME.size
-        if opcode == Opcode.CHUNK:
-            head = stream.read(CHUNK_HEAD.size)
-            if len(head) == CHUNK_HEAD.size:
-                end = min(body + length, size)
-                start = CHUNK_HEAD.unpack(head)[0]
-                self.pieces.append(_Piece(offset, end - offset, start, is_chunk=True))
-        check_frame(opcode, length, size - body)
-        return opcode, body + length
 
-
-def _check_magic(path: Path, beginning: bytes) -> None:
-    if beginning.startswith(MAGIC):
-        return
+def _refusal(path: Path, beginning: bytes) -> InputError:
     if not beginning:
-        problem = "is empty: record it again"
+        problem = "is empty; record it again"
     elif beginning.startswith(_ZSTD_MAGIC):
-        problem = "is compressed as a whole: unpack it with `zstd -d`"
+        problem = "is compressed as a whole; unpack it with `zstd -d`"
     elif beginning.startswith(_SQLITE_MAGIC):
-        problem = "is an SQLite bag: convert it with `ros2 bag convert`"
+        problem = "is an SQLite bag; convert it with `ros2 bag convert`"
     else:
-        problem = "is no MCAP file: name a rosbag2 folder or an .mcap file"
-    raise InputError(f"{path} {problem}.")
+        problem = "is no MCAP file; name a rosbag2 folder or an .mcap file"
+    return InputError(f"{path}: {problem}")
 
 
 def _unreadable(path: Path, fault: OSError) -> InputError:
     return InputError(
-        f"{path} cannot be read ({fault.strerror}): check that it is a file or folder that you "
-        "may read."
+        f"{path}: cannot be read ({fault.strerror}); check that it is a file or folder that you "
+        "may read"
     )
-
-
-def _content(stream: IO[bytes], offset: int, end: int) -> bytes:
-    stream.seek(offset + FRAME.size)
-    return stream.read(end - offset - FRAME.size)
-
-
-def _check_end(stream: IO[bytes], offset: int) -> None:
-    stream.seek(offset)
-    if stream.read(len(MAGIC)) != MAGIC:
-        raise DamageError("the file does not end as MCAP files do")
 
 
 class _Run:
@@ -428,16 +394,16 @@ class _Run:
 
     def __init__(self, pieces: list[_Piece]) -> None:
         self._pieces = pieces
-        self._offset = self._end = self._start = 0
+        self._start = self._end = self._time = 0
 
-    def add(self, offset: int, end: int, time: int) -> None:
-        if offset != self._end or end - self._offset > _RUN_SIZE:
-            self.end()
-            self._offset, self._start = offset, time
-        self._end, self._start = end, min(self._start, time)
+    def add(self, start: int, end: int, time: int) -> None:
+        if start != self._end or end - self._start > _RUN_SIZE:
+            self.finish()
+            self._start, self._time = start, time
+        self._end, self._time = end, min(self._time, time)
 
-    def end(self) -> None:
+    def finish(self) -> None:
         if self._end:
-            length = self._end - self._offset
-            self._pieces.append(_Piece(self._offset, length, self._start, is_chunk=False))
-        self._offset = self._end = 0
+            piece = _Piece(self._start, self._start, self._end, self._time, is_chunk=False)
+            self._pieces.append(piece)
+        self._start = self._end = 0

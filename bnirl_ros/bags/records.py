@@ -1,85 +1,58 @@
-"""MCAP records in bytes: their framing, the few kinds that reading needs, and what breaks them.
+"""MCAP records of files that may be cut off or altered.
 
-Written for files that are cut off or altered: whatever can be read before the damage is returned
-with it, and no length that a file claims is believed before it is checked.
+What the bytes of a record mean is left to the library `mcap`. Ours is what it doesn't do: to find
+the damage and go on behind it, to keep what a damaged chunk still holds, and to believe no length
+that a file claims before it is checked.
 """
 
 from __future__ import annotations
 
 import struct
+import sys
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from enum import IntEnum
 from io import BytesIO
-from typing import NamedTuple
+from typing import IO, Any, NamedTuple
 
-MAGIC = b"\x89MCAP0\r\n"
-"""The first and the last eight bytes of every MCAP file."""
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Schema, Statistics
+from mcap.stream_reader import read_magic
 
 CHUNK_LIMIT = 2**30
 """Bytes to which a chunk may unpack; a chunk that claims more is refused, not unpacked."""
 
-# Opcode and length of the content come before every record.
-FRAME = struct.Struct("<BQ")
-# Start and end [ns], unpacked size and checksum, and the length of the compression's name.
-CHUNK_HEAD = struct.Struct("<QQQII")
-# Channel, sequence number, log time and publish time [ns] come before a message's data.
-MESSAGE_HEAD = struct.Struct("<HIQQ")
-
+_FRAME = struct.Struct("<BQ")  # opcode and length of the content, before every record
 _UNPACK_STEP = 32 * 1024  # bytes: so little is lost before damage in a compressed chunk
 
-
-class Opcode(IntEnum):
-    """The kinds of record that reading messages needs."""
-
-    FOOTER = 0x02
-    SCHEMA = 0x03
-    CHANNEL = 0x04
-    MESSAGE = 0x05
-    CHUNK = 0x06
-    STATISTICS = 0x0B
+# The kinds of record that are read, beside messages; and how much tells all but their data.
+_READERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
+    Opcode.FOOTER: Footer.read,
+    Opcode.SCHEMA: Schema.read,
+    Opcode.CHANNEL: Channel.read,
+    Opcode.CHUNK: Chunk.read,
+    Opcode.STATISTICS: Statistics.read,
+}
+_HEAD_SIZES: dict[int, int] = {Opcode.MESSAGE: 22, Opcode.CHUNK: 64}
 
 
 class DamageError(Exception):
     """Bytes that are no MCAP; the text says what is wrong with them. Never leaves this package."""
 
 
-@dataclass(frozen=True)
-class Schema:
-    """A message type as the file defines it."""
+class Frame(NamedTuple):
+    """Where a record lies in its stream: from `offset` to `end`, its content from `start`.
 
-    id: int
-    name: str
-    encoding: str
-    data: bytes
+    `damage` says why not all of it is there, if it isn't.
+    """
 
-
-@dataclass(frozen=True)
-class Channel:
-    """A topic as the file defines it; `schema_id` 0 means that it has no schema."""
-
-    id: int
-    schema_id: int
-    topic: str
-    encoding: str
-    metadata: dict[str, str]
-
-
-@dataclass(frozen=True)
-class Statistics:
-    """What the summary says of the file: its channels, and messages by channel id."""
-
-    channels: int
-    messages: dict[int, int]
-
-
-class StoredMessage(NamedTuple):
-    """One message as it lies in the file."""
-
-    channel_id: int
-    log_time: int
-    data: bytes
+    opcode: int
+    offset: int
+    start: int
+    end: int
+    damage: str | None = None
 
 
 @dataclass
@@ -88,236 +61,153 @@ class Contents:
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
-    messages: list[StoredMessage] = field(default_factory=list)
+    messages: list[Message] = field(default_factory=list)
     damage: str | None = None
 
 
-def records_in(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Opcode, start and end of the content of each record in the bytes.
+class _Fields(ReadDataStream):
+    """The fields in the content of a record, cut `short` where one claims more than is there."""
+
+    def __init__(self, content: bytes) -> None:
+        super().__init__(BytesIO(content))
+        self.short = False
+
+    def read(self, length: int) -> bytes:
+        data = super().read(min(length, sys.maxsize))
+        self.short |= len(data) < length
+        return data
+
+
+def has_magic(stream: IO[bytes]) -> bool:
+    """Whether the next eight bytes are those with which MCAP files begin and end."""
+    try:
+        return bool(_parsed(read_magic, ReadDataStream(stream)))
+    except DamageError:
+        return False
+
+
+def frames_in(stream: IO[bytes], offset: int, size: int) -> Iterator[Frame]:
+    """The records from an offset on, with the stream placed at the content of each.
+
+    The last frame is a damaged one, if only because the stream has come to its end.
+    """
+    damage = None
+    while damage is None:
+        stream.seek(offset)
+        frame = stream.read(_FRAME.size)
+        start = offset + _FRAME.size
+        opcode, length = _FRAME.unpack(frame) if len(frame) == _FRAME.size else (0, 0)
+        if len(frame) < _FRAME.size:
+            damage = "it breaks off there, as an interrupted recording does"
+        elif opcode == 0:
+            damage = "there is no record where one should begin"
+        elif length > size - start:
+            damage = f"a record claims {length} bytes where {size - start} are left"
+        yield Frame(opcode, offset, start, min(start + length, size), damage)
+        offset = start + length
+
+
+def head_at(stream: IO[bytes], frame: Frame) -> McapRecord | None:
+    """The record at a frame, from a stream placed at its content; None for those of no interest.
+
+    A message comes without its data and a chunk with little of them. Of the records that break
+    off only a chunk is of interest, for it can be unpacked as far as it goes.
 
     Raises:
-        DamageError: at the first record that isn't whole.
+        DamageError: the record has fields that cannot be read.
     """
-    place, size = 0, len(data)
-    while place < size:
-        if size - place < FRAME.size:
-            raise DamageError("a record breaks off")
-        opcode, length = FRAME.unpack_from(data, place)
-        place += FRAME.size
-        check_frame(opcode, length, size - place)
-        yield opcode, place, place + length
-        place += length
-
-
-def check_frame(opcode: int, length: int, room: int) -> None:
-    """Whether a record can be: of some kind, and no longer than the room left for it.
-
-    Raises:
-        DamageError: it can't.
-    """
-    if opcode == 0:
-        raise DamageError("there is no record where one should begin")
-    if length > room:
-        raise DamageError(f"a record claims {length} bytes where {room} are left")
+    if frame.damage is not None and frame.opcode != Opcode.CHUNK:
+        return None
+    size = frame.end - frame.start
+    return _record(stream, frame.opcode, min(size, _HEAD_SIZES.get(frame.opcode, size)))
 
 
 def contents_of(data: bytes) -> Contents:
     """The schemas, channels and messages in a stretch of records, as far as it is whole."""
     contents = Contents()
-    try:
-        for opcode, start, end in records_in(data):
+    stream = BytesIO(data)
+    for frame in frames_in(stream, 0, len(data)):
+        if frame.offset == len(data):
+            break
+        damage = frame.damage
+        record = None
+        if damage is None:
             try:
-                _add_record(contents, opcode, data, start, end)
-            except DamageError as damage:
-                # The frame is whole, so the records after this one can still be read.
-                contents.damage = contents.damage or str(damage)
-    except DamageError as damage:
-        contents.damage = contents.damage or str(damage)
+                record = _record(stream, frame.opcode, frame.end - frame.start)
+            except DamageError as fault:
+                damage = str(fault)  # but the records after this one can still be read
+        if isinstance(record, Message):
+            contents.messages.append(record)
+        elif isinstance(record, Channel):
+            contents.channels[record.id] = record
+        elif isinstance(record, Schema):
+            contents.schemas[record.id] = record
+        contents.damage = contents.damage or damage
     return contents
 
 
-def _add_record(contents: Contents, opcode: int, data: bytes, start: int, end: int) -> None:
-    if opcode == Opcode.MESSAGE:
-        contents.messages.append(_message(data, start, end))
-    elif opcode == Opcode.CHANNEL:
-        channel = parse_channel(data[start:end])
-        contents.channels[channel.id] = channel
-    elif opcode == Opcode.SCHEMA:
-        schema = parse_schema(data[start:end])
-        contents.schemas[schema.id] = schema
-
-
-def contents_of_chunk(data: bytes) -> Contents:
+def contents_of_chunk(content: bytes) -> Contents:
     """What the content of a chunk record holds, unpacked as far as it is whole."""
+    fields = _Fields(content)
     try:
-        unpacked, damage = _unpack_chunk(data)
+        unpacked, damage = _unpacked(_parsed(Chunk.read, fields))
     except DamageError as fault:
         return Contents(damage=str(fault))
     contents = contents_of(unpacked)
-    contents.damage = damage or contents.damage
+    contents.damage = "a chunk breaks off" if fields.short else damage or contents.damage
     return contents
 
 
-def parse_schema(content: bytes) -> Schema:
-    """The schema in the content of its record.
-
-    Raises:
-        DamageError: there is none.
-    """
-    cursor = _Cursor(content)
-    return Schema(
-        id=cursor.integer("<H"),
-        name=cursor.text(),
-        encoding=cursor.text(),
-        data=cursor.take(cursor.integer("<I")),
-    )
-
-
-def parse_channel(content: bytes) -> Channel:
-    """The channel in the content of its record.
-
-    Raises:
-        DamageError: there is none.
-    """
-    cursor = _Cursor(content)
-    identifier, schema_id = cursor.integer("<H"), cursor.integer("<H")
-    topic, encoding = cursor.text(), cursor.text()
-    pairs = _Cursor(cursor.take(cursor.integer("<I")))
-    metadata = {}
-    while pairs.left:
-        key = pairs.text()
-        metadata[key] = pairs.text()
-    return Channel(identifier, schema_id, topic, encoding, metadata)
+def _record(stream: IO[bytes], opcode: int, size: int) -> McapRecord | None:
+    """The record whose content comes next in a stream; None for kinds that are not read."""
+    if opcode == Opcode.MESSAGE:
+        if size < _HEAD_SIZES[opcode]:  # the library would read on to the stream's end
+            raise DamageError("a message is too short")
+        return _parsed(Message.read, ReadDataStream(stream), size)
+    if opcode not in _READERS:
+        return None
+    fields = _Fields(stream.read(size))
+    record = _parsed(_READERS[opcode], fields)
+    if fields.short and opcode != Opcode.CHUNK:
+        raise DamageError("a field is longer than its record")
+    return record
 
 
-def parse_statistics(content: bytes) -> Statistics:
-    """The statistics in the content of their record.
-
-    Raises:
-        DamageError: there are none.
-    """
-    cursor = _Cursor(content)
-    cursor.take(8 + 2)  # numbers of messages and schemas
-    channels = cursor.integer("<I")
-    cursor.take(4 + 4 + 4 + 8 + 8)  # numbers of attachments, metadata and chunks; first, last time
-    counts = _Cursor(cursor.take(cursor.integer("<I")))
-    messages = {}
-    while counts.left:
-        channel_id = counts.integer("<H")
-        messages[channel_id] = counts.integer("<Q")
-    return Statistics(channels, messages)
+def _parsed(read: Callable[..., Any], stream: ReadDataStream, *arguments: int) -> Any:
+    """What a function of the library reads; all that it raises for bad bytes is damage."""
+    try:
+        return read(stream, *arguments)
+    except (McapError, struct.error, UnicodeDecodeError) as fault:
+        raise DamageError("a record has fields that cannot be read") from fault
 
 
-def message_time(content: bytes) -> int:
-    """The log time [ns] in the content of a message record, or in its beginning.
-
-    Raises:
-        DamageError: it is too short.
-    """
-    if len(content) < MESSAGE_HEAD.size:
-        raise DamageError("a message is too short")
-    return int(MESSAGE_HEAD.unpack_from(content)[2])
-
-
-def _message(data: bytes, start: int, end: int) -> StoredMessage:
-    body = start + MESSAGE_HEAD.size
-    if body > end:
-        raise DamageError("a message is too short")
-    channel_id, _, log_time, _ = MESSAGE_HEAD.unpack_from(data, start)
-    return StoredMessage(channel_id, log_time, data[body:end])
-
-
-class _Cursor:
-    """Reads fields from bytes, one after the other."""
-
-    def __init__(self, data: bytes) -> None:
-        self._data = data
-        self._place = 0
-
-    @property
-    def left(self) -> int:
-        return len(self._data) - self._place
-
-    def take(self, length: int) -> bytes:
-        if length > self.left:
-            raise DamageError("a field is longer than its record")
-        self._place += length
-        return self._data[self._place - length : self._place]
-
-    def integer(self, layout: str) -> int:
-        return int(struct.unpack(layout, self.take(struct.calcsize(layout)))[0])
-
-    def text(self) -> str:
-        try:
-            return self.take(self.integer("<I")).decode()
-        except UnicodeDecodeError:
-            raise DamageError("a text is no UTF-8") from None
-
-
-def _unpack_chunk(content: bytes) -> tuple[bytes, str | None]:
-    """A chunk's records and, where they are not all, why."""
-    if len(content) < CHUNK_HEAD.size:
-        raise DamageError("a chunk breaks off")
-    _, _, size, checksum, name_length = CHUNK_HEAD.unpack_from(content)
-    cursor = _Cursor(content)
-    cursor.take(CHUNK_HEAD.size)
-    compression = cursor.take(name_length).decode(errors="replace")
-    packed_size = cursor.integer("<Q")
-    packed = cursor.take(min(packed_size, cursor.left))
-    if size > CHUNK_LIMIT:
-        raise DamageError(f"a chunk claims to unpack to {size} bytes, more than {CHUNK_LIMIT}")
-    if compression not in _UNPACKERS:
-        raise DamageError(
-            f"a chunk is compressed by {compression[:20]!r}, which is no zstd or lz4"
-        )
-    unpacked, damage = _UNPACKERS[compression](packed, size)
-    if len(packed) < packed_size:
-        damage = "a chunk breaks off"
-    elif damage is None and len(unpacked) != size:
-        damage = f"a chunk unpacks to {len(unpacked)} bytes instead of {size}"
-    elif damage is None and checksum not in (0, zlib.crc32(unpacked)):
-        damage = "a chunk's checksum is wrong, so that its messages may be altered"
-    return unpacked, damage
-
-
-def _unpack_none(packed: bytes, size: int) -> tuple[bytes, str | None]:
-    return packed[: size + 1], None
-
-
-def _unpack_zstd(packed: bytes, size: int) -> tuple[bytes, str | None]:
+def _unpacked(chunk: Chunk) -> tuple[bytes, str | None]:
+    """A chunk's records as far as they can be unpacked and, where they are not all, why."""
+    import lz4.frame
     import zstandard
 
-    reader = zstandard.ZstdDecompressor().stream_reader(BytesIO(packed), read_across_frames=True)
-    return _collect(reader.read, size, zstandard.ZstdError)
-
-
-def _unpack_lz4(packed: bytes, size: int) -> tuple[bytes, str | None]:
-    import lz4.frame
-
-    file = lz4.frame.LZ4FrameFile(BytesIO(packed))
-    return _collect(file.read1, size, (RuntimeError, EOFError))
-
-
-def _collect(
-    read: Callable[[int], bytes],
-    size: int,
-    errors: type[Exception] | tuple[type[Exception], ...],
-) -> tuple[bytes, str | None]:
-    """Unpack in steps, so that what comes before damage is kept; one byte past `size` at most."""
+    size, packed = chunk.uncompressed_size, BytesIO(chunk.data)
+    if size > CHUNK_LIMIT:
+        raise DamageError(f"a chunk claims to unpack to {size} bytes, more than {CHUNK_LIMIT}")
+    read: Callable[[int], bytes]
+    if chunk.compression == "":
+        read = packed.read
+    elif chunk.compression == "zstd":
+        read = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True).read
+    elif chunk.compression == "lz4":
+        read = lz4.frame.LZ4FrameFile(packed).read1
+    else:
+        name = chunk.compression[:20]
+        raise DamageError(f"a chunk is compressed by {name!r}, which is no zstd or lz4")
     unpacked = bytearray()
     try:
-        while len(unpacked) <= size:
-            step = read(min(_UNPACK_STEP, size + 1 - len(unpacked)))
-            if not step:
-                break
+        # In steps, so that what comes before damage is kept; one byte past the size at most.
+        while step := read(min(_UNPACK_STEP, size + 1 - len(unpacked))):
             unpacked += step
-    except errors:
+    except (zstandard.ZstdError, RuntimeError, EOFError):
         return bytes(unpacked), "a chunk cannot be unpacked to its end"
+    if len(unpacked) != size:
+        return bytes(unpacked), f"a chunk unpacks to {len(unpacked)} bytes instead of {size}"
+    if chunk.uncompressed_crc not in (0, zlib.crc32(unpacked)):
+        return bytes(unpacked), "a chunk's checksum is wrong, so that its messages may be altered"
     return bytes(unpacked), None
-
-
-_UNPACKERS: dict[str, Callable[[bytes, int], tuple[bytes, str | None]]] = {
-    "": _unpack_none,
-    "zstd": _unpack_zstd,
-    "lz4": _unpack_lz4,
-}
