@@ -9,13 +9,14 @@ from bnirl_ros.errors import InputError
 from bnirl_ros.maps.grid_map import GridMap
 from bnirl_ros.maps.nav2_map import read_nav2_map
 from bnirl_ros.maps.occupancy import map_from_occupancy, occupancy_of, yaw_of
-from bnirl_ros.maps.text_grid import read_text_grid
+from bnirl_ros.maps.text_grid import parse_text_grid, read_text_grid
 
 __all__ = [
     "GridMap",
     "load_map",
     "map_from_occupancy",
     "occupancy_of",
+    "parse_text_grid",
     "read_nav2_map",
     "read_text_grid",
     "yaw_of",

@@ -33,6 +33,20 @@ def read_text_grid(path: str | Path) -> GridMap:
         raise InputError(
             f"{path}: the map cannot be read ({error.strerror}); check the path"
         ) from None
+    return parse_text_grid(text, str(path))
+
+
+def parse_text_grid(text: str, source: str) -> GridMap:
+    """The map that a text draws, as `read_text_grid` reads it.
+
+    Args:
+        text: the rows, the last one y = 0.
+        source: the file or whatever holds the text, for the error's sentence.
+
+    Raises:
+        InputError: there is no row, the lines differ in length, there is another character than
+            `#` and `.`, or no cell is free.
+    """
     # str.splitlines would also split at form feeds and the like and miscount the lines.
     lines = text.rstrip("\n").split("\n")
     width = len(lines[0])
@@ -40,15 +54,15 @@ def read_text_grid(path: str | Path) -> GridMap:
         for column, character in enumerate(line, start=1):
             if character not in _OCCUPANCY:
                 raise InputError(
-                    f"{path}: line {number}, column {column} is {character!r};"
+                    f"{source}: line {number}, column {column} is {character!r};"
                     " write '#' for a blocked cell and '.' for a free one"
                 )
         if len(line) != width:
             raise InputError(
-                f"{path}: line {number} ends after column {len(line)}, line 1 after column"
+                f"{source}: line {number} ends after column {len(line)}, line 1 after column"
                 f" {width}; make all lines equally long"
             )
     occupancy = np.array([[_OCCUPANCY[character] for character in line] for line in lines[::-1]])
     return map_from_occupancy(
-        occupancy, width, len(lines), 1.0, (0.0, 0.0, 0.0), "map", source=str(path)
+        occupancy, width, len(lines), 1.0, (0.0, 0.0, 0.0), "map", source=source
     )
