@@ -1,0 +1,87 @@
+"""Make the bags that come with the package: `python -m bnirl_ros.experiments.make_bags`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from bnirl_ros.errors import InputError
+from bnirl_ros.experiments import overcooked
+from bnirl_ros.experiments.demonstration_bag import (
+    bag_size,
+    write_demonstration,
+    write_what_fits,
+)
+from bnirl_ros.experiments.scenarios import SCENARIOS, Scenario, shipped_demonstration
+
+SIMULATED_STEP = 0.5
+"""Time between two actions of a simulated demonstrator [s]; the paper knows no seconds."""
+
+LAYOUTS = ("random3", "asymmetric_advantages")
+"""Layouts of Overcooked-AI whose human play is made a bag."""
+
+LICENCE_FILE = "LICENSE"
+
+
+def make_scenario_bag(scenario: Scenario, out: Path) -> Path:
+    """Write the bag of a scenario into the folder `out`; returns the bag."""
+    bag = out / scenario.name
+    demonstration = shipped_demonstration(scenario)
+    write_demonstration(bag, demonstration, scenario.grid_map, SIMULATED_STEP)
+    return bag
+
+
+def make_overcooked_bag(source: Path, layout: str, out: Path) -> tuple[Path, int]:
+    """Write the bag of a layout, and its licence, into the folder `out`.
+
+    Args:
+        source: folder with the recordings, see `overcooked.read_overcooked`.
+        layout: its name there.
+        out: where the bag `overcooked_<layout>` goes.
+
+    Returns:
+        The bag, and how many episodes fitted into it.
+
+    Raises:
+        InputError: the recordings are missing or wrong.
+    """
+    demonstration, grid_map = overcooked.read_overcooked(source, layout)
+    bag = out / f"overcooked_{layout}"
+    episodes = write_what_fits(bag, demonstration, grid_map, overcooked.STEP)
+    (bag / LICENCE_FILE).write_text(overcooked.LICENCE, encoding="utf-8")
+    return bag, episodes
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status: 0, 1 for missing or wrong recordings."""
+    parser = argparse.ArgumentParser(
+        prog="make_bags", description="Make the bags that come with the package."
+    )
+    parser.add_argument(
+        "--overcooked",
+        type=Path,
+        metavar="FOLDER",
+        default=Path("../shared/data/overcooked"),
+        help="human play to convert: <layout>.csv and <layout>.grid.txt (%(default)s)",
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("bags"), help="folder for the bags (%(default)s)"
+    )
+    options = parser.parse_args(arguments)
+    try:
+        for scenario in SCENARIOS.values():
+            bag = make_scenario_bag(scenario, options.out)
+            print(f"{bag}: {scenario.episodes} episodes, {bag_size(bag)} bytes")
+        for layout in LAYOUTS:
+            bag, episodes = make_overcooked_bag(options.overcooked, layout, options.out)
+            print(f"{bag}: {episodes} episodes, {bag_size(bag)} bytes")
+    except InputError as error:
+        print(f"make_bags: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
