@@ -8,6 +8,8 @@ PYTHON ?=
 WITH ?=
 # Further arguments for pytest, such as PYTEST_ARGS='-k bags -x'.
 PYTEST_ARGS ?=
+# The folder with the recordings of human play, for `make bags`.
+OVERCOOKED ?= ../shared/data/overcooked
 
 BIN := $(VENV)/bin
 export PYTHON WITH
@@ -21,7 +23,7 @@ endif
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 unexport AMENT_PREFIX_PATH PYTHONPATH PYTHONHOME RMW_IMPLEMENTATION
 
-.PHONY: help demo test lint unit venv clean
+.PHONY: help demo test lint unit bags venv clean
 
 help:  ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -38,6 +40,9 @@ lint: venv  ## Check style and types
 
 unit: venv  ## Run the tests, without the checks of style and types
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+bags: venv  ## Make the bags in bags/ again
+	$(BIN)/python -m bnirl_ros.experiments.make_bags --overcooked "$(OVERCOOKED)"
 
 venv:  ## Make the virtual environment, or bring it up to date
 	@scripts/venv $(VENV)
