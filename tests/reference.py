@@ -102,7 +102,8 @@ class PlainSampler:
     """Algorithm 2 in plain Python, drawing the same random numbers as the kernel.
 
     With `printed_sum`, subgoals are drawn from (17) as the paper prints it: with the sum over the
-    observations of a partition where the joint (10) has a product.
+    observations of a partition where the joint (10) has a product. With `redraw`, partitions are
+    drawn anew at the end of a sweep, given the subgoals.
     """
 
     def __init__(
@@ -110,9 +111,11 @@ class PlainSampler:
         mixture: SubgoalMixture,
         generator: np.random.Generator,
         printed_sum: bool = False,
+        redraw: bool = False,
     ) -> None:
         self.generator = generator
         self.printed_sum = printed_sum
+        self.redraw = redraw
         self.members: list[list[int]] = [list(range(len(mixture.pair_of)))]
         self.subgoals = [
             int(generator.choice(len(mixture.log_prior), p=np.exp(mixture.log_prior)))
@@ -143,6 +146,24 @@ class PlainSampler:
                 self.members.append([])
                 self.subgoals.append(self._categorical(prior * likelihood[i]))
             self.members[table].append(i)
+        if self.redraw:
+            self._redraw(mixture)
+
+    def _redraw(self, mixture: SubgoalMixture) -> None:
+        """Among observations with one subgoal, a CRP with concentration eta P(g)."""
+        count = len(mixture.pair_of)
+        subgoal_of = self.subgoal_of(count)
+        self.members, self.subgoals = [], []
+        for i in range(count):
+            tables = [t for t, g in enumerate(self.subgoals) if g == subgoal_of[i]][::-1]
+            weights = [len(self.members[table]) for table in tables]
+            weights.append(mixture.eta * np.exp(mixture.log_prior[subgoal_of[i]]))
+            choice = self._categorical(np.array(weights))
+            if choice == len(tables):
+                self.members.append([i])
+                self.subgoals.append(int(subgoal_of[i]))
+            else:
+                self.members[tables[choice]].append(i)
 
     def _take_out(self, i: int) -> None:
         table = next(t for t, members in enumerate(self.members) if i in members)

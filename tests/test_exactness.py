@@ -71,10 +71,10 @@ def drawn_by_kernel(mixture: SubgoalMixture, draws: int, seed: int) -> Draws:
 
 
 def drawn_by_plain_sampler(
-    mixture: SubgoalMixture, draws: int, seed: int, printed_sum: bool
+    mixture: SubgoalMixture, draws: int, seed: int, printed_sum: bool, redraw: bool = False
 ) -> Draws:
     count = len(mixture.pair_of)
-    sampler = PlainSampler(mixture, np.random.default_rng(seed), printed_sum)
+    sampler = PlainSampler(mixture, np.random.default_rng(seed), printed_sum, redraw)
     kept = Draws.empty((draws,), count)
     for draw in range(draws):
         sampler.sweep(mixture)
@@ -135,7 +135,7 @@ def test_the_kernel_is_its_plain_twin_draw_for_draw() -> None:
         state = partition_gibbs.initial_state(mixture, generator)
         kept = Draws.empty((300,), count)
         partition_gibbs.advance(mixture, state, generator, kept)
-        plain = drawn_by_plain_sampler(mixture, 300, 7, False)
+        plain = drawn_by_plain_sampler(mixture, 300, 7, False, redraw=True)
         np.testing.assert_array_equal(kept.partition_of, plain.partition_of)
         np.testing.assert_array_equal(kept.subgoal_of, plain.subgoal_of)
 

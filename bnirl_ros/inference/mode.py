@@ -14,16 +14,10 @@ import numpy.typing as npt
 from numba import njit
 
 from bnirl_ros.inference.draws import Draws
-from bnirl_ros.inference.partition_gibbs import (
-    PartitionState,
-    log_joint,
-    put_in,
-    subgoal_scores,
-    take_out,
-)
 from bnirl_ros.model.mixture import SubgoalMixture
 
 _GAIN = 1e-9  # nats; a smaller gain is rounding, and following it could go round in a circle
+_REPLACEMENTS = 8  # candidates tried in a partition's subgoal's place, the most likely ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,215 +42,242 @@ def posterior_mode(mixture: SubgoalMixture, chains: Draws) -> Mode:
         mixture: the model that was sampled.
         chains: draws with leading axes (chain, draw).
     """
-    modes = [
-        ascend(mixture, chain.partition_of[best], chain.subgoal_of[best])
-        for chain in (chains[index] for index in range(len(chains)))
-        for best in [int(chain.log_joint.argmax())]
+    starts = [
+        chains.subgoal_of[chain, best]
+        for chain, best in enumerate(chains.log_joint.argmax(axis=1))
     ]
-    return max(modes, key=lambda mode: mode.log_joint)
+    return max((ascend(mixture, start) for start in starts), key=lambda mode: mode.log_joint)
 
 
-def ascend(
-    mixture: SubgoalMixture, partition_of: npt.ArrayLike, subgoal_of: npt.ArrayLike
-) -> Mode:
-    """Coordinate ascent on (10) from one partition (N,) and its subgoals by observation (N,).
+def ascend(mixture: SubgoalMixture, subgoal_of: npt.ArrayLike) -> Mode:
+    """Coordinate ascent on (10) from each observation's subgoal (N,), one partition for each.
 
-    In turn, until nothing gains: single observations to the best partition, old or new; each
-    partition's subgoal; a whole subgoal given up, its observations to the next best; a whole
-    subgoal taken up, with the observations that it explains better.
+    First equal observations move together, in turn until nothing gains: all equal ones to the
+    best partition, old or new; each partition's subgoal; a whole partition given up, or its
+    subgoal replaced; a candidate taken up, with what it explains better. Then single ones, which
+    is of use only where eta is large.
     """
-    alone = mixture.log_prior + mixture.log_likelihood
-    labels, first = np.unique(np.asarray(partition_of), return_index=True)
-    state = PartitionState.from_subgoals(
-        np.searchsorted(labels, np.asarray(partition_of)), np.asarray(subgoal_of)[first]
-    )
-    best = _ascend(
-        mixture.log_likelihood,
+    start = np.asarray(subgoal_of, dtype=np.int64)
+    pairs, index, counts = np.unique(mixture.pair_of, return_inverse=True, return_counts=True)
+    votes = np.zeros((len(pairs), len(mixture.log_prior)), dtype=np.int64)
+    np.add.at(votes, (index, start), 1)
+    log_factorial = np.array([0.0, *(math.lgamma(n) for n in range(1, len(start) + 1))])
+    by_pair = _ascend(
+        mixture.log_likelihood[pairs],
+        counts,
         mixture.log_prior,
-        mixture.eta,
-        mixture.pair_of,
-        np.argsort(mixture.pair_of, kind="stable"),
-        alone.argmax(axis=1),
-        alone.max(axis=1) + math.log(mixture.eta),
-        *state.arrays(),
+        math.log(mixture.eta),
+        log_factorial,
+        *_partitions(votes.argmax(axis=1)),
+        True,
     )
-    _, first, index = np.unique(state.partition_of, return_index=True, return_inverse=True)
-    order = np.argsort(np.argsort(first))
+    partition_of, subgoal_of_partition = _ascend(
+        mixture.log_likelihood[mixture.pair_of],
+        np.ones(len(start), dtype=np.int64),
+        mixture.log_prior,
+        math.log(mixture.eta),
+        log_factorial,
+        by_pair[0][index],
+        np.resize(by_pair[1], len(start)),
+        False,
+    )
+    labels, first, number = np.unique(partition_of, return_index=True, return_inverse=True)
+    in_order = np.argsort(np.argsort(first))[number]
+    subgoals = subgoal_of_partition[labels]
     return Mode(
-        subgoal_of=state.subgoal_of_slot[state.partition_of],
-        partition_of=order[index].astype(np.int32),
-        log_joint=float(best),
+        subgoal_of=subgoals[number].astype(np.int32),
+        partition_of=in_order.astype(np.int32),
+        log_joint=mixture.log_joint(number, subgoals),
     )
+
+
+def _partitions(
+    subgoal_of: npt.NDArray[np.int64],
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """One partition for each subgoal: number of each item's, and subgoals with room for more."""
+    subgoals, partition_of = np.unique(subgoal_of, return_inverse=True)
+    return partition_of, np.resize(subgoals, len(subgoal_of))
 
 
 @njit(nogil=True, cache=True)
 def _ascend(  # type: ignore[no-untyped-def]
-    log_likelihood,
-    log_prior,
-    eta,
-    pair_of,
-    by_pair,
-    best_alone,
-    value_alone,
-    partition_of,
-    subgoal_of_slot,
-    size_of_slot,
-    slots,
-    position_of_slot,
-    occupied,
+    log_likelihood, counts, log_prior, log_eta, log_factorial, partition_of, subgoals, whole
 ):
-    """See `ascend`. `best_alone`, `value_alone` (K,): what a partition of one's own is worth."""
-    model = (log_likelihood, log_prior, eta, pair_of, by_pair, best_alone, value_alone)
-    state = (partition_of, subgoal_of_slot, size_of_slot, slots, position_of_slot, occupied)
-    best = _climb(model, state)
-    gained = True
+    """Ascent over items: `counts` (I,) equal observations each, with likelihoods (I, G).
+
+    Partitions are numbered without gaps; `subgoals` (I,) holds theirs, then room for more. With
+    `whole`, whole partitions are given up, replaced and taken up too.
+    """
+    best_alone = np.empty(counts.shape[0], dtype=np.int64)
+    value_alone = np.empty(counts.shape[0])
+    for item in range(counts.shape[0]):
+        row = log_prior + counts[item] * log_likelihood[item]
+        best_alone[item] = row.argmax()
+        value_alone[item] = log_eta + row.max() + log_factorial[counts[item]]
+    model = (log_likelihood, counts, log_prior, log_eta, log_factorial, best_alone, value_alone)
+    partition_of, subgoals = partition_of.copy(), subgoals.copy()
+    best = _climb(model, partition_of, subgoals)
+    gained = whole
     while gained:
         gained = False
-        position = 0
-        while position < occupied[0]:
-            trial = _copy(state)
-            _give_up(model, trial, position)
-            value = _climb(model, trial)
-            if value > best + _GAIN:
-                best = value
-                _assign(state, trial)
-                gained = True
-            else:
-                position += 1
-        for candidate in range(log_prior.shape[0]):
-            trial = _copy(state)
-            if _take_up(model, trial, candidate):
-                value = _climb(model, trial)
+        partition = 0
+        while partition <= partition_of.max():
+            likely = _scores(model, partition_of, partition).argsort()[-_REPLACEMENTS:]
+            for candidate in range(-1, likely.shape[0]):
+                trial, trial_subgoals = partition_of.copy(), subgoals.copy()
+                if candidate >= 0:
+                    trial_subgoals[partition] = likely[candidate]
+                elif not _give_up(model, trial, trial_subgoals, partition):
+                    continue
+                value = _climb(model, trial, trial_subgoals)
                 if value > best + _GAIN:
-                    best = value
-                    _assign(state, trial)
+                    best, partition_of, subgoals = value, trial, trial_subgoals
                     gained = True
-    return best
+                    break
+            partition += 1
+        for candidate in range(log_prior.shape[0]):
+            trial, trial_subgoals = partition_of.copy(), subgoals.copy()
+            if _take_up(model, trial, trial_subgoals, candidate):
+                value = _climb(model, trial, trial_subgoals)
+                if value > best + _GAIN:
+                    best, partition_of, subgoals = value, trial, trial_subgoals
+                    gained = True
+    return partition_of, subgoals
 
 
 @njit(nogil=True, cache=True)
-def _copy(state):  # type: ignore[no-untyped-def]
-    partition_of, subgoal_of_slot, size_of_slot, slots, position_of_slot, occupied = state
-    return (
-        partition_of.copy(),
-        subgoal_of_slot.copy(),
-        size_of_slot.copy(),
-        slots.copy(),
-        position_of_slot.copy(),
-        occupied.copy(),
-    )
+def _sizes(model, partition_of):  # type: ignore[no-untyped-def]
+    """Observations in each partition, with room for as many partitions as items and one more."""
+    sizes = np.zeros(partition_of.shape[0] + 1, dtype=np.int64)
+    for item in range(partition_of.shape[0]):
+        sizes[partition_of[item]] += model[1][item]
+    return sizes
 
 
 @njit(nogil=True, cache=True)
-def _assign(state, other):  # type: ignore[no-untyped-def]
-    partition_of, subgoal_of_slot, size_of_slot, slots, position_of_slot, occupied = state
-    partition_of[:] = other[0]
-    subgoal_of_slot[:] = other[1]
-    size_of_slot[:] = other[2]
-    slots[:] = other[3]
-    position_of_slot[:] = other[4]
-    occupied[:] = other[5]
+def _scores(model, partition_of, partition):  # type: ignore[no-untyped-def]
+    """(G,) log P(g) + sum over a partition of log P(O_i | g): log of (17) with its product."""
+    log_likelihood, counts, log_prior, _, _, _, _ = model
+    scores = log_prior.copy()
+    for item in range(partition_of.shape[0]):
+        if partition_of[item] == partition:
+            scores += counts[item] * log_likelihood[item]
+    return scores
 
 
 @njit(nogil=True, cache=True)
-def _climb(model, state):  # type: ignore[no-untyped-def]
-    """Single observations and partitions' subgoals until nothing gains; returns log of (10)."""
-    log_likelihood, log_prior, eta, pair_of, by_pair, _, _ = model
-    partition_of, subgoal_of_slot, size_of_slot, slots, position_of_slot, occupied = state
+def _climb(model, partition_of, subgoals):  # type: ignore[no-untyped-def]
+    """Items and partitions' subgoals in turn until nothing gains; (10) but for a constant."""
+    log_likelihood, counts, log_prior, log_eta, log_factorial, _, _ = model
+    sizes = _sizes(model, partition_of)
     moved = True
     while moved:
         moved = False
-        scores = subgoal_scores(
-            log_likelihood, log_prior, pair_of, by_pair, partition_of, position_of_slot, occupied
-        )
-        for position in range(occupied[0]):
-            slot = slots[position]
-            candidate = scores[position].argmax()
-            if scores[position, candidate] > scores[position, subgoal_of_slot[slot]] + _GAIN:
-                subgoal_of_slot[slot] = candidate
+        for item in range(partition_of.shape[0]):
+            moved = _move(model, partition_of, subgoals, sizes, item) or moved
+        _close_gaps(partition_of, subgoals, sizes)
+        for partition in range(partition_of.max() + 1):
+            scores = _scores(model, partition_of, partition)
+            likeliest = scores.argmax()
+            if scores[likeliest] > scores[subgoals[partition]] + _GAIN:
+                subgoals[partition] = likeliest
                 moved = True
-        for i in range(partition_of.shape[0]):
-            moved = _move_one(model, state, i) or moved
-    return log_joint(
-        log_likelihood,
-        log_prior,
-        eta,
-        pair_of,
-        partition_of,
-        subgoal_of_slot,
-        size_of_slot,
-        slots,
-        occupied,
-    )
+    total = 0.0
+    for partition in range(partition_of.max() + 1):
+        total += log_eta + log_prior[subgoals[partition]] + log_factorial[sizes[partition]]
+    for item in range(partition_of.shape[0]):
+        total += counts[item] * log_likelihood[item, subgoals[partition_of[item]]]
+    return total
 
 
 @njit(nogil=True, cache=True)
-def _move_one(model, state, i):  # type: ignore[no-untyped-def]
-    """Move observation i to the partition where (10) is largest; whether that gained."""
-    log_likelihood, log_prior, eta, pair_of, _, best_alone, value_alone = model
-    partition_of, subgoal_of_slot, size_of_slot, slots, position_of_slot, occupied = state
-    row = log_likelihood[pair_of[i]]
-    old = partition_of[i]
-    take_out(i, partition_of, size_of_slot, slots, position_of_slot, occupied)
-    if size_of_slot[old] > 0:
-        stays = math.log(size_of_slot[old]) + row[subgoal_of_slot[old]]
-    else:
-        stays = math.log(eta) + log_prior[subgoal_of_slot[old]] + row[subgoal_of_slot[old]]
-    best = stays + _GAIN
-    target = position_of_slot[old]
-    for position in range(occupied[0]):
-        slot = slots[position]
-        value = math.log(size_of_slot[slot]) + row[subgoal_of_slot[slot]]
-        if value > best:
-            best = value
-            target = position
-    if value_alone[pair_of[i]] > best:
-        best = value_alone[pair_of[i]]
-        target = occupied[0]
-        subgoal_of_slot[slots[target]] = best_alone[pair_of[i]]
-    put_in(i, target, partition_of, size_of_slot, slots, occupied)
+def _close_gaps(partition_of, subgoals, sizes):  # type: ignore[no-untyped-def]
+    """Number the partitions without gaps."""
+    number = np.empty(sizes.shape[0], dtype=np.int64)
+    count = 0
+    for partition in range(sizes.shape[0]):
+        if sizes[partition] > 0:
+            number[partition] = count
+            subgoals[count] = subgoals[partition]
+            sizes[count] = sizes[partition]
+            count += 1
+    sizes[count:] = 0
+    for item in range(partition_of.shape[0]):
+        partition_of[item] = number[partition_of[item]]
+
+
+@njit(nogil=True, cache=True)
+def _joining(model, subgoals, sizes, item, partition):  # type: ignore[no-untyped-def]
+    """What (10) gains when an item that is in no partition joins one, which may be empty."""
+    log_likelihood, counts, log_prior, log_eta, log_factorial, _, _ = model
+    count, size = counts[item], sizes[partition]
+    value = count * log_likelihood[item, subgoals[partition]] + log_factorial[size + count]
+    if size == 0:
+        return value + log_eta + log_prior[subgoals[partition]]
+    return value - log_factorial[size]
+
+
+@njit(nogil=True, cache=True)
+def _move(model, partition_of, subgoals, sizes, item):  # type: ignore[no-untyped-def]
+    """Move an item where (10) is largest; whether that gained."""
+    count, best_alone, value_alone = model[1][item], model[5][item], model[6][item]
+    old = partition_of[item]
+    sizes[old] -= count
+    stays = _joining(model, subgoals, sizes, item, old)
+    best, target = stays + _GAIN, old
+    empty = -1
+    for partition in range(partition_of.shape[0]):
+        if sizes[partition] > 0:
+            value = _joining(model, subgoals, sizes, item, partition)
+            if value > best:
+                best, target = value, partition
+        elif empty < 0:
+            empty = partition
+            if sizes[partition:].max() == 0:
+                break
+    if value_alone > best:
+        best, target = value_alone, empty
+        subgoals[target] = best_alone
+    sizes[target] += count
+    partition_of[item] = target
     return best > stays + _GAIN
 
 
 @njit(nogil=True, cache=True)
-def _give_up(model, state, position):  # type: ignore[no-untyped-def]
-    """Move every observation of the partition at `position` to the best of the others."""
-    log_likelihood, _, _, pair_of, _, _, _ = model
-    partition_of, subgoal_of_slot, size_of_slot, slots, position_of_slot, occupied = state
-    if occupied[0] < 2:
-        return
-    given_up = slots[position]
-    for i in range(partition_of.shape[0]):
-        if partition_of[i] != given_up:
-            continue
-        take_out(i, partition_of, size_of_slot, slots, position_of_slot, occupied)
-        best = -np.inf
-        target = 0
-        for other in range(occupied[0]):
-            slot = slots[other]
-            if slot != given_up:
-                value = math.log(size_of_slot[slot])
-                value += log_likelihood[pair_of[i], subgoal_of_slot[slot]]
-                if value > best:
-                    best = value
-                    target = other
-        put_in(i, target, partition_of, size_of_slot, slots, occupied)
+def _give_up(model, partition_of, subgoals, given_up):  # type: ignore[no-untyped-def]
+    """Move every item of a partition to the best of the others; whether there are others."""
+    sizes = _sizes(model, partition_of)
+    count = partition_of.max() + 1
+    if count < 2:
+        return False
+    for item in range(partition_of.shape[0]):
+        if partition_of[item] == given_up:
+            best, target = -np.inf, -1
+            for partition in range(count):
+                if partition != given_up:
+                    value = _joining(model, subgoals, sizes, item, partition)
+                    if value > best:
+                        best, target = value, partition
+            sizes[target] += model[1][item]
+            partition_of[item] = target
+    sizes[given_up] = 0
+    _close_gaps(partition_of, subgoals, sizes)
+    return True
 
 
 @njit(nogil=True, cache=True)
-def _take_up(model, state, candidate):  # type: ignore[no-untyped-def]
+def _take_up(model, partition_of, subgoals, candidate):  # type: ignore[no-untyped-def]
     """Gather in a new partition what `candidate` explains better; whether there is any."""
-    log_likelihood, _, _, pair_of, _, _, _ = model
-    partition_of, subgoal_of_slot, size_of_slot, slots, position_of_slot, occupied = state
-    taken_up = -1
-    for i in range(partition_of.shape[0]):
-        row = log_likelihood[pair_of[i]]
-        if row[candidate] > row[subgoal_of_slot[partition_of[i]]] + _GAIN:
-            take_out(i, partition_of, size_of_slot, slots, position_of_slot, occupied)
-            if taken_up < 0:
-                taken_up = slots[occupied[0]]
-                subgoal_of_slot[taken_up] = candidate
-                put_in(i, occupied[0], partition_of, size_of_slot, slots, occupied)
-            else:
-                put_in(i, position_of_slot[taken_up], partition_of, size_of_slot, slots, occupied)
-    return taken_up >= 0
+    log_likelihood = model[0]
+    new = partition_of.max() + 1
+    if new == partition_of.shape[0]:
+        return False
+    taken = False
+    for item in range(partition_of.shape[0]):
+        row = log_likelihood[item]
+        if row[candidate] > row[subgoals[partition_of[item]]] + _GAIN:
+            partition_of[item] = new
+            taken = True
+    subgoals[new] = candidate
+    _close_gaps(partition_of, subgoals, _sizes(model, partition_of))
+    return taken

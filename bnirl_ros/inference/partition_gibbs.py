@@ -4,6 +4,9 @@ Against the page: the subgoal of a partition is drawn from the product of its ob
 likelihoods, where (16) and (17) print a sum (the joint (10) is a product); an observation is taken
 out of its partition before its own draw (14); and the weight of a new partition is the exact sum
 over all candidates, since P(g) is discrete.
+
+Beyond the page: at the end of a sweep the partitions are drawn anew given the subgoals, which
+leaves the posterior as it is and lets partitions that share a subgoal become one.
 """
 
 from __future__ import annotations
@@ -134,8 +137,9 @@ def advance(
 ) -> None:
     """Sweep on from `state`, changing it, until all of `draws` is filled.
 
-    A sweep draws each partition's subgoal from (17) and then each observation's partition from
-    (14). Every `thin`-th sweep is recorded. Releases the GIL; equal generators give equal draws.
+    A sweep draws each partition's subgoal from (17), each observation's partition from (14), and
+    all partitions given the subgoals. Every `thin`-th sweep is recorded. Releases the GIL; equal
+    generators give equal draws.
     """
     _advance(
         mixture.log_likelihood,
@@ -198,6 +202,17 @@ def _advance(  # type: ignore[no-untyped-def]
                 prior,
                 pair_of,
                 everyone,
+                generator,
+                partition_of,
+                subgoal_of_slot,
+                size_of_slot,
+                slots,
+                position_of_slot,
+                occupied,
+            )
+            _redraw_partitions(
+                prior,
+                eta,
                 generator,
                 partition_of,
                 subgoal_of_slot,
@@ -315,6 +330,49 @@ def _draw_partitions(  # type: ignore[no-untyped-def]
             likely = prior * scaled_likelihood[pair]
             subgoal_of_slot[slots[count]] = _categorical(likely, likely.sum(), generator)
         put_in(i, position, partition_of, size_of_slot, slots, occupied)
+
+
+@njit(nogil=True, cache=True)
+def _redraw_partitions(  # type: ignore[no-untyped-def]
+    prior,
+    eta,
+    generator,
+    partition_of,
+    subgoal_of_slot,
+    size_of_slot,
+    slots,
+    position_of_slot,
+    occupied,
+):
+    """All partitions anew, given every observation's subgoal.
+
+    P(z | subgoals) is proportional to prod_j eta P(g_j) (n_j - 1)!: among the observations with
+    subgoal g, a Chinese restaurant process with concentration eta P(g). Without this step two
+    partitions that found the same subgoal take very long to become one, observation by
+    observation.
+    """
+    subgoal_of = subgoal_of_slot[partition_of]
+    seated = np.zeros(prior.shape[0], dtype=np.int64)
+    first_slot = np.full(prior.shape[0], -1, dtype=np.int64)
+    next_slot = np.full(partition_of.shape[0], -1, dtype=np.int64)
+    size_of_slot[:] = 0
+    occupied[0] = 0
+    for i in range(partition_of.shape[0]):
+        subgoal = subgoal_of[i]
+        remaining = generator.random() * (seated[subgoal] + eta * prior[subgoal])
+        slot = first_slot[subgoal]
+        while slot >= 0:
+            remaining -= size_of_slot[slot]
+            if remaining < 0.0:
+                break
+            slot = next_slot[slot]
+        if slot < 0:
+            slot = slots[occupied[0]]
+            next_slot[slot] = first_slot[subgoal]
+            first_slot[subgoal] = slot
+            subgoal_of_slot[slot] = subgoal
+        seated[subgoal] += 1
+        put_in(i, position_of_slot[slot], partition_of, size_of_slot, slots, occupied)
 
 
 @njit(nogil=True, cache=True)

@@ -26,8 +26,10 @@ from bnirl_ros.nodes.conversion import message_class, to_ros
 from bnirl_ros.nodes.running import run
 from bnirl_ros.views.belief import map_message
 
-_DEPTH = 1000  # of a reliable publisher at least, so that one round of messages fits
-_ROUND = 250  # messages sent before all of them must be acknowledged
+# Messages kept by a reliable publisher at least, and sent before all must be acknowledged. Both
+# are large, since Fast DDS asks subscribers for acknowledgement only every three seconds.
+_DEPTH = 40_000
+_ROUND = 20_000
 _LOOK_PERIOD = 0.05  # [s] between two looks at whether to stop
 _STUCK_AFTER = 10.0  # [s] without acknowledgement after which a subscriber is given up
 
@@ -58,7 +60,6 @@ class ReplayNode(Node):
         self.sent: Counter[str] = Counter()
         self.skipped: dict[str, str] = {}
         self._topic_publishers: dict[str, Any] = {}
-        self._latched: set[str] = set()
         for topic in bag.topics():
             self._announce(topic)
 
@@ -97,7 +98,8 @@ class ReplayNode(Node):
         as soon as the subscribers have acknowledged those before.
         """
         start: tuple[float, int] | None = None
-        for number, message in enumerate(messages, start=1):
+        unacknowledged = 0
+        for message in messages:
             publisher = self._topic_publishers.get(message.topic)
             if publisher is None:
                 continue
@@ -109,8 +111,10 @@ class ReplayNode(Node):
                     _rest(min(left, _LOOK_PERIOD))
             publisher.publish(message.data)
             self.sent[message.topic] += 1
-            if message.topic in self._latched or (rate is None and number % _ROUND == 0):
+            unacknowledged += 1
+            if rate is None and unacknowledged == _ROUND:
                 self.wait_until_acknowledged()
+                unacknowledged = 0
         self.wait_until_acknowledged()
 
     def wait_until_acknowledged(self) -> None:
@@ -142,9 +146,7 @@ class ReplayNode(Node):
             self.skipped[topic.name] = f"type {topic.type_name or 'unknown'} isn't installed"
             return
         recorded = topic.qos[0] if topic.qos else QosProfile()
-        if recorded.durability == LATCHED.durability:
-            self._latched.add(topic.name)
-        elif recorded.reliability != "best_effort":
+        if recorded.durability != LATCHED.durability and recorded.reliability != "best_effort":
             recorded = replace(recorded, depth=max(recorded.depth, _DEPTH))
         self._topic_publishers[topic.name] = self.create_publisher(
             kind, topic.name, qos_profile(recorded)
