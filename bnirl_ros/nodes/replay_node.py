@@ -26,10 +26,12 @@ from bnirl_ros.nodes.conversion import message_class, to_ros
 from bnirl_ros.nodes.running import run
 from bnirl_ros.views.belief import map_message
 
-# Messages kept by a reliable publisher at least, and sent before all must be acknowledged. Both
-# are large, since Fast DDS asks subscribers for acknowledgement only every three seconds.
-_DEPTH = 40_000
-_ROUND = 20_000
+_DEPTH = 1000  # of a reliable publisher at least that plays at a pace
+# Playing as fast as can be, so many messages of a topic are sent before all must be acknowledged.
+# It is also the depth of the publisher: when the history is full, Fast DDS asks subscribers for
+# acknowledgement (and has it in some 6 ms); otherwise it asks every three seconds only. And it is
+# small: what overflows the transport is sent again at 256 messages in three seconds.
+_ROUND = 50
 _LOOK_PERIOD = 0.05  # [s] between two looks at whether to stop
 _STUCK_AFTER = 10.0  # [s] without acknowledgement after which a subscriber is given up
 
@@ -54,9 +56,15 @@ class Options:
 class ReplayNode(Node):
     """Publishes a bag's messages as they were recorded: bytes, order, pace and QoS."""
 
-    def __init__(self, bag: Bag) -> None:
-        """Announce the bag's topics; those of a type that isn't installed are left out."""
+    def __init__(self, bag: Bag, rate: float | None) -> None:
+        """Announce the bag's topics; those of a type that isn't installed are left out.
+
+        Args:
+            bag: the bag.
+            rate: factor on the recorded pace; None: as fast as the subscribers acknowledge.
+        """
         super().__init__("replay_node")
+        self._rate = rate
         self.sent: Counter[str] = Counter()
         self.skipped: dict[str, str] = {}
         self._topic_publishers: dict[str, Any] = {}
@@ -91,44 +99,42 @@ class ReplayNode(Node):
         self._topic_publishers["/map"].publish(to_ros(view))
         self.sent["/map"] += 1
 
-    def play(self, messages: Iterable[RawMessage], rate: float | None) -> None:
+    def play(self, messages: Iterable[RawMessage]) -> None:
         """Publish messages in their order.
 
         With a rate, each is sent at its recorded time since the first one over the rate; without,
         as soon as the subscribers have acknowledged those before.
         """
         start: tuple[float, int] | None = None
-        unacknowledged = 0
         for message in messages:
             publisher = self._topic_publishers.get(message.topic)
             if publisher is None:
                 continue
             if start is None:
                 start = (time.monotonic(), message.log_time)
-            if rate is not None:
-                due = start[0] + (message.log_time - start[1]) / 1e9 / rate
+            if self._rate is not None:
+                due = start[0] + (message.log_time - start[1]) / 1e9 / self._rate
                 while (left := due - time.monotonic()) > 0.0:
                     _rest(min(left, _LOOK_PERIOD))
             publisher.publish(message.data)
             self.sent[message.topic] += 1
-            unacknowledged += 1
-            if rate is None and unacknowledged == _ROUND:
-                self.wait_until_acknowledged()
-                unacknowledged = 0
-        self.wait_until_acknowledged()
+            if self._rate is None and self.sent[message.topic] % _ROUND == 0:
+                self.wait_until_acknowledged(message.topic)
+        for topic in self._topic_publishers:
+            self.wait_until_acknowledged(topic)
 
-    def wait_until_acknowledged(self) -> None:
+    def wait_until_acknowledged(self, topic: str) -> None:
         """Wait until every reliable subscriber has what was sent, unless one doesn't answer."""
-        for topic, publisher in self._topic_publishers.items():
-            deadline = time.monotonic() + _STUCK_AFTER
-            while not publisher.wait_for_all_acked(Duration(seconds=_LOOK_PERIOD)):
-                _rest(0.0)
-                if time.monotonic() > deadline:
-                    self.get_logger().warning(
-                        f"a subscriber of {topic} doesn't acknowledge; goes on",
-                        throttle_duration_sec=10.0,
-                    )
-                    break
+        publisher = self._topic_publishers[topic]
+        deadline = time.monotonic() + _STUCK_AFTER
+        while not publisher.wait_for_all_acked(Duration(seconds=_LOOK_PERIOD)):
+            _rest(0.0)
+            if time.monotonic() > deadline:
+                self.get_logger().warning(
+                    f"a subscriber of {topic} doesn't acknowledge; goes on without it",
+                    throttle_duration_sec=10.0,
+                )
+                return
 
     def report(self) -> str:
         """A line on what was sent, and what was not and why."""
@@ -147,7 +153,8 @@ class ReplayNode(Node):
             return
         recorded = topic.qos[0] if topic.qos else QosProfile()
         if recorded.durability != LATCHED.durability and recorded.reliability != "best_effort":
-            recorded = replace(recorded, depth=max(recorded.depth, _DEPTH))
+            depth = _ROUND if self._rate is None else max(recorded.depth, _DEPTH)
+            recorded = replace(recorded, depth=depth)
         self._topic_publishers[topic.name] = self.create_publisher(
             kind, topic.name, qos_profile(recorded)
         )
@@ -183,7 +190,7 @@ def replay(options: Options) -> int:
         InputError: the bag or the map cannot be used.
     """
     bag = Bag(options.bag)
-    node = ReplayNode(bag)
+    node = ReplayNode(bag, options.rate)
     log = node.get_logger()
     try:
         for warning in bag.warnings:
@@ -193,7 +200,7 @@ def replay(options: Options) -> int:
         for topic, why in node.skipped.items():
             log.warning(f"{topic} is not sent: {why}")
         node.wait_for_subscribers(options.patience)
-        node.play(bag.messages(), options.rate)
+        node.play(bag.messages())
         if bag.damage:
             raise InputError(bag.damage)
         return 0
