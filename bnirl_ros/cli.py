@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import gc
+import importlib.util
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -65,6 +66,19 @@ def _parser() -> argparse.ArgumentParser:
     )
     _add_settings(infer)
     infer.set_defaults(run=_infer, command=infer)
+
+    replay = commands.add_parser(
+        "replay", help="play a recorded demonstration onto its topics", add_help=False
+    )
+    replay.add_argument("arguments", nargs=argparse.REMAINDER)
+    replay.set_defaults(run=_replay)
+
+    demo = commands.add_parser("demo", help="watch a human demonstration become subgoals")
+    demo.add_argument("--bag", type=Path, help="another bag than the human demonstration")
+    demo.add_argument(
+        "--out", type=Path, default=Path("bnirl_out"), help="folder for the results (%(default)s)"
+    )
+    demo.set_defaults(run=_demo)
     return parser
 
 
@@ -127,12 +141,37 @@ def _infer(options: argparse.Namespace) -> int:
         posterior = infer(demonstration, grid_map, settings, progress)
     summary = summarise(posterior, grid_map)
     written = write_results(options.out, posterior, summary, grid_map, settings)
-    print(subgoal_table(summary))
+    print(subgoal_table(summary.subgoals, summary.visit_sequence))
     print(convergence(summary))
     print(f"Written: {', '.join(str(file) for file in written)}")
     if damage:
         raise InputError(f"{damage}; the results are from what could be read")
     return 0
+
+
+def _replay(options: argparse.Namespace) -> int:
+    """`bnirl replay`: the same as replay_node."""
+    _needs_ros()
+    from bnirl_ros.nodes.replay_node import main as replay
+
+    return replay(options.arguments)
+
+
+def _demo(options: argparse.Namespace) -> int:
+    """`bnirl demo`: both nodes, a human bag, and what comes of it."""
+    _needs_ros()
+    from bnirl_ros.nodes.demo import main as demo
+    from bnirl_ros.resources import share_folder
+
+    bag = options.bag or share_folder() / "bags" / "overcooked_asymmetric_advantages"
+    return demo(bag, options.out)
+
+
+def _needs_ros() -> None:
+    if importlib.util.find_spec("rclpy") is None:
+        raise InputError(
+            "rclpy is not installed; source a ROS 2 installation, or pip install 'bnirl_ros[ros]'"
+        )
 
 
 def _read(

@@ -264,7 +264,7 @@ def test_an_action_is_its_step_in_map_axes(action, step):
 
 
 def test_the_table_says_what_the_summary_says(summary):
-    assert subgoal_table(summary).splitlines() == [
+    assert subgoal_table(summary.subgoals, summary.visit_sequence).splitlines() == [
         "rank    cell      place [m]  probability  observations  order",
         "   1  (4, 2)  (8.75, 22.25)         1.00             3      2",
         "   2  (0, 0)  (9.75, 20.25)         0.99             1      1",

@@ -144,17 +144,22 @@ class BagWriter:
                 encoded, or the time lies outside 0 to 2^63 - 1.
         """
         channel = self._channels.get(topic)
+        if channel is not None and channel.type_name != message.TYPE:
+            raise ValueError(f"The topic {topic} carries {channel.type_name}, no {message.TYPE}.")
+        self.write_encoded(topic, encode(message), log_time_ns)
+
+    def write_encoded(self, topic: str, data: bytes, log_time_ns: int) -> None:
+        """Add a message that is CDR already, as `write` does; its bytes are not looked at."""
+        channel = self._channels.get(topic)
         if channel is None:
             raise ValueError(f"The topic {topic} was not added to the bag.")
-        if channel.type_name != message.TYPE:
-            raise ValueError(f"The topic {topic} carries {channel.type_name}, no {message.TYPE}.")
         if not 0 <= log_time_ns <= _NEVER:
             raise ValueError(f"{log_time_ns} ns is no time that a bag can hold.")
         self._open_writer().add_message(
             channel_id=channel.id,
             log_time=log_time_ns,
             publish_time=log_time_ns,
-            data=encode(message),
+            data=data,
         )
         channel.messages += 1
         self._start = log_time_ns if self._start is None else min(self._start, log_time_ns)

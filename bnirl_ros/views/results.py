@@ -15,7 +15,7 @@ import numpy.typing as npt
 from bnirl_ros.errors import InputError
 from bnirl_ros.inference.posterior import Posterior
 from bnirl_ros.inference.settings import Settings
-from bnirl_ros.inference.summary import Summary
+from bnirl_ros.inference.summary import Subgoal, Summary
 from bnirl_ros.maps.grid_map import GridMap
 from bnirl_ros.views.plot import draw_summary
 
@@ -82,6 +82,7 @@ def subgoals_document(summary: Summary, grid_map: GridMap, settings: Settings) -
             }
             for subgoal in summary.subgoals
         ],
+        "visit_sequence": list(summary.visit_sequence),
         "diagnostics": {
             "rhat": _finite(summary.rhat),
             "ess": _finite(summary.ess),
@@ -89,6 +90,21 @@ def subgoals_document(summary: Summary, grid_map: GridMap, settings: Settings) -
             "draws": summary.draws,
         },
     }
+
+
+def subgoals_in(document: Mapping[str, Any]) -> tuple[Subgoal, ...]:
+    """The subgoals that the content of a subgoals.json tells."""
+    return tuple(
+        Subgoal(
+            rank=entry["rank"],
+            cell=(entry["cell"][0], entry["cell"][1]),
+            position=(entry["position"][0], entry["position"][1]),
+            probability=entry["probability"],
+            observations=entry["observations"],
+            visit_order=tuple(entry["visit_order"]),
+        )
+        for entry in document["subgoals"]
+    )
 
 
 def posterior_arrays(posterior: Posterior) -> dict[str, npt.NDArray[Any]]:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from bnirl_ros.inference.summary import Summary
+from collections.abc import Sequence
+
+from bnirl_ros.inference.summary import Subgoal, Summary
 
 _HEADINGS = ("rank", "cell", "place [m]", "probability", "observations", "order")
 
 
-def subgoal_table(summary: Summary) -> str:
+def subgoal_table(subgoals: Sequence[Subgoal], visit_sequence: Sequence[int]) -> str:
     """One aligned line for each subgoal below a line of headings; no newline at the end.
 
     Columns: rank; cell (x, y); place, the centre of the cell in the map frame [m]; probability;
     number of observations; order, the 1-based position in the visit sequence.
     """
-    order = {rank: position for position, rank in enumerate(summary.visit_sequence, start=1)}
+    order = {rank: position for position, rank in enumerate(visit_sequence, start=1)}
     rows = [
         (
             str(subgoal.rank),
@@ -23,7 +25,7 @@ def subgoal_table(summary: Summary) -> str:
             str(subgoal.observations),
             str(order.get(subgoal.rank, "-")),
         )
-        for subgoal in summary.subgoals
+        for subgoal in subgoals
     ]
     table = [_HEADINGS, *rows]
     widths = [max(len(row[column]) for row in table) for column in range(len(_HEADINGS))]
