@@ -161,10 +161,8 @@ def _demo(options: argparse.Namespace) -> int:
     """`bnirl demo`: both nodes, a human bag, and what comes of it."""
     _needs_ros()
     from bnirl_ros.nodes.demo import main as demo
-    from bnirl_ros.resources import share_folder
 
-    bag = options.bag or share_folder() / "bags" / "overcooked_asymmetric_advantages"
-    return demo(bag, options.out)
+    return demo(options.bag, options.out)
 
 
 def _needs_ros() -> None:

@@ -22,9 +22,11 @@ from bnirl_ros.bags.qos import LATCHED, QosProfile
 from bnirl_ros.bags.writer import BagWriter
 from bnirl_ros.demonstrations.messages import TOPIC_TYPES
 from bnirl_ros.errors import InputError
+from bnirl_ros.inference.settings import Settings
 from bnirl_ros.nodes.conversion import message_class
 from bnirl_ros.nodes.running import run
 from bnirl_ros.nodes.subgoal_node import OUTPUTS
+from bnirl_ros.resources import share_folder
 from bnirl_ros.views.messages import DiagnosticArray
 from bnirl_ros.views.results import subgoals_in
 from bnirl_ros.views.tables import subgoal_table
@@ -34,6 +36,12 @@ _RECORDED = {
     **{f"/{name}": type_name for name, type_name in OUTPUTS.items()},
     "/diagnostics": DiagnosticArray.TYPE,
 }
+HUMAN_BAG = "overcooked_random3"
+"""The bag that is replayed unless another one is named: two people's play, 16 episodes."""
+
+HUMAN_ALPHA = 5.0
+"""Confidence for it: people dither and stand about, optimal demonstrators (the default) do not."""
+
 _PATIENCE = 300.0  # [s] for anything that is waited for
 _END_PATIENCE = 20.0  # [s] for a node to end
 
@@ -91,18 +99,21 @@ class _Watcher(Node):
         )
 
 
-def demo(bag: Path, out: Path) -> int:
-    """Replay a bag to the node in processes of their own; returns the exit status.
+def demo(bag: Path, out: Path, alpha: float) -> None:
+    """Replay a bag to the node, both in processes of their own, and print what comes of it.
 
     Leaves in `out` the three result files of an inference, and a bag of what was published.
+
+    Raises:
+        InputError: a node ended with an error, or didn't answer in time.
     """
     with ExitStack() as stack:
         writer = stack.enter_context(BagWriter(out / "published", overwrite=True))
         watcher = _Watcher(writer)
         stack.callback(watcher.destroy_node)
         tell = stack.enter_context(_teller())
-        results = ["--ros-args", "-p", f"result_folder:={out.resolve()}"]
-        node = stack.enter_context(_process("subgoal_node", results))
+        parameters = ["-p", f"result_folder:={out.resolve()}", "-p", f"alpha:={alpha}"]
+        node = stack.enter_context(_process("subgoal_node", ["--ros-args", *parameters]))
         replay = stack.enter_context(_process("replay_node", [str(bag), "--fast"]))
 
         def ended(process: subprocess.Popen[bytes], name: str) -> bool:
@@ -126,7 +137,6 @@ def demo(bag: Path, out: Path) -> int:
         if not answer.done() or not answer.result().success:
             raise InputError(answer.result().message if answer.done() else "subgoal_node ended")
     _show(out)
-    return 0
 
 
 def _show(out: Path) -> None:
@@ -179,8 +189,10 @@ def _teller() -> Iterator[Callable[[str], None]]:
     yield tell
 
 
-def main(bag: Path, out: Path) -> int:
-    """Run the demo; returns the exit status."""
+def main(bag: Path | None, out: Path) -> int:
+    """Run the demo with the human bag or another one; returns the exit status."""
     # Other machines' robots need not hear of it.
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    return run("bnirl demo", lambda: demo(bag, out), [])
+    alpha = HUMAN_ALPHA if bag is None else Settings().alpha
+    played = bag or share_folder() / "bags" / HUMAN_BAG
+    return run("bnirl demo", lambda: demo(played, out, alpha), [])

@@ -183,11 +183,11 @@ def qos_profile(recorded: QosProfile) -> QoSProfile:
     )
 
 
-def replay(options: Options) -> int:
-    """Play a bag; returns the exit status: 1 if the bag is damaged, though played as far as it is.
+def replay(options: Options) -> None:
+    """Play a bag; a damaged one as far as it can be read.
 
     Raises:
-        InputError: the bag or the map cannot be used.
+        InputError: the bag or the map cannot be used, or the bag is damaged.
     """
     bag = Bag(options.bag)
     node = ReplayNode(bag, options.rate)
@@ -203,7 +203,6 @@ def replay(options: Options) -> int:
         node.play(bag.messages())
         if bag.damage:
             raise InputError(bag.damage)
-        return 0
     finally:
         print(node.report(), flush=True)
         node.destroy_node()

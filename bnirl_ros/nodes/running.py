@@ -13,7 +13,7 @@ from rclpy.executors import ExternalShutdownException
 from bnirl_ros.errors import InputError
 
 
-def run(name: str, body: Callable[[], int | None], arguments: Sequence[str] | None = None) -> int:
+def run(name: str, body: Callable[[], None], arguments: Sequence[str] | None = None) -> int:
     """Call `body` between rclpy's start and its end; returns the exit status.
 
     Args:
@@ -23,7 +23,8 @@ def run(name: str, body: Callable[[], int | None], arguments: Sequence[str] | No
     """
     try:
         rclpy.init(args=None if arguments is None else [name, *arguments])
-        return body() or 0
+        body()
+        return 0
     except (KeyboardInterrupt, ExternalShutdownException, ROSInterruptException):
         return 0
     except InputError as error:
