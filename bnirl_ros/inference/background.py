@@ -18,7 +18,10 @@ from bnirl_ros.inference.settings import Settings
 from bnirl_ros.inference.summary import Summary, summarise
 from bnirl_ros.maps.grid_map import GridMap
 
-_ROUND = 0.25  # [s] aimed at between two results: time for sweeps, not for repeating itself
+# Sweeping time [s] between two results: soon for the first one after a change, then longer, so
+# that the time is spent on sweeps.
+_FIRST_ROUND = 0.1
+_ROUND = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,10 +209,10 @@ class BackgroundInference:
                 return Result(grid_map, placement, None, 0)
             self._running = RunningPosterior(placement, grid_map, settings, self._running)
         running = self._running
-        start = time.monotonic()
+        end = time.monotonic() + (_ROUND if running.sweeps else _FIRST_ROUND)
         while True:
             running.advance(4)
-            if self._changed or running.finished or time.monotonic() - start > _ROUND:
+            if self._changed or running.finished or time.monotonic() > end:
                 break
         summary = summarise(running.posterior(), running.grid_map)
         return Result(running.grid_map, running.placement, summary, running.sweeps)

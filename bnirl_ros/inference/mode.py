@@ -52,10 +52,13 @@ def posterior_mode(mixture: SubgoalMixture, chains: Draws) -> Mode:
 def ascend(mixture: SubgoalMixture, subgoal_of: npt.ArrayLike) -> Mode:
     """Coordinate ascent on (10) from each observation's subgoal (N,), one partition for each.
 
-    First equal observations move together, in turn until nothing gains: all equal ones to the
-    best partition, old or new; each partition's subgoal; a whole partition given up, or its
-    subgoal replaced; a candidate taken up, with what it explains better. Then single ones, which
-    is of use only where eta is large.
+    Equal observations move together, in turn until nothing gains: all equal ones to the best
+    partition, old or new; each partition's subgoal; a whole partition given up, or its subgoal
+    replaced; a candidate taken up, with what it explains better.
+
+    Apart, equal observations would gain only where eta P(g) > 1 for some g: as (10) is convex in
+    how many of them are in one partition rather than in another, either all are or none, and only
+    a new partition for a single one could be better than for all. There single ones move too.
     """
     start = np.asarray(subgoal_of, dtype=np.int64)
     pairs, index, counts = np.unique(mixture.pair_of, return_inverse=True, return_counts=True)
@@ -71,16 +74,18 @@ def ascend(mixture: SubgoalMixture, subgoal_of: npt.ArrayLike) -> Mode:
         *_partitions(votes.argmax(axis=1)),
         True,
     )
-    partition_of, subgoal_of_partition = _ascend(
-        mixture.log_likelihood[mixture.pair_of],
-        np.ones(len(start), dtype=np.int64),
-        mixture.log_prior,
-        math.log(mixture.eta),
-        log_factorial,
-        by_pair[0][index],
-        np.resize(by_pair[1], len(start)),
-        False,
-    )
+    partition_of, subgoal_of_partition = by_pair[0][index], by_pair[1]
+    if mixture.eta * math.exp(mixture.log_prior.max()) > 1.0:
+        partition_of, subgoal_of_partition = _ascend(
+            mixture.log_likelihood[mixture.pair_of],
+            np.ones(len(start), dtype=np.int64),
+            mixture.log_prior,
+            math.log(mixture.eta),
+            log_factorial,
+            partition_of,
+            np.resize(subgoal_of_partition, len(start)),
+            False,
+        )
     labels, first, number = np.unique(partition_of, return_index=True, return_inverse=True)
     in_order = np.argsort(np.argsort(first))[number]
     subgoals = subgoal_of_partition[labels]

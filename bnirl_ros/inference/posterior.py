@@ -44,10 +44,10 @@ class Posterior:
     def subgoal_probability(self) -> npt.NDArray[np.float64]:
         """(G,) share of the draws in which each candidate is some observation's subgoal."""
         drawn = self.draws.subgoal_of.reshape(-1, len(self.demonstration))
-        occurs = np.zeros(len(self.candidates))
-        for subgoals in drawn:
-            occurs[np.bincount(subgoals, minlength=len(occurs)) > 0] += 1.0
-        return occurs / len(drawn)
+        occurs = np.zeros((len(drawn), len(self.candidates)), dtype=np.bool_)
+        for present, subgoals in zip(occurs, drawn, strict=True):
+            present[subgoals] = True
+        return occurs.mean(axis=0)
 
     def assignment_probability(self) -> npt.NDArray[np.float64]:
         """(N, G) share of the draws in which each candidate is the observation's subgoal."""
