@@ -7,6 +7,8 @@ carries stray subgoals with an observation or two.
 from __future__ import annotations
 
 import math
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,11 +44,16 @@ def posterior_mode(mixture: SubgoalMixture, chains: Draws) -> Mode:
         mixture: the model that was sampled.
         chains: draws with leading axes (chain, draw).
     """
-    starts = [
-        chains.subgoal_of[chain, best]
-        for chain, best in enumerate(chains.log_joint.argmax(axis=1))
-    ]
-    return max((ascend(mixture, start) for start in starts), key=lambda mode: mode.log_joint)
+    starts = np.unique(
+        [
+            chains.subgoal_of[chain, best]
+            for chain, best in enumerate(chains.log_joint.argmax(axis=1))
+        ],
+        axis=0,
+    )
+    with ThreadPoolExecutor(min(len(starts), os.cpu_count() or 1)) as threads:
+        modes = list(threads.map(lambda start: ascend(mixture, start), starts))
+    return max(modes, key=lambda mode: mode.log_joint)
 
 
 def ascend(mixture: SubgoalMixture, subgoal_of: npt.ArrayLike) -> Mode:

@@ -118,7 +118,7 @@ def draw_summary(
             verticalalignment="center",
         )
     with Path(path).open("wb") as file:
-        canvas.print_png(file, metadata={"Software": None})
+        canvas.print_png(file, metadata={"Software": None}, pil_kwargs={"compress_level": 2})
 
 
 def _layout(grid_map: GridMap, subgoals: int, top: float) -> _Layout:
