@@ -10,6 +10,7 @@ import math
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -71,86 +72,98 @@ def ascend(mixture: SubgoalMixture, subgoal_of: npt.ArrayLike) -> Mode:
     pairs, index, counts = np.unique(mixture.pair_of, return_inverse=True, return_counts=True)
     votes = np.zeros((len(pairs), len(mixture.log_prior)), dtype=np.int64)
     np.add.at(votes, (index, start), 1)
-    log_factorial = np.array([0.0, *(math.lgamma(n) for n in range(1, len(start) + 1))])
-    by_pair = _ascend(
-        mixture.log_likelihood[pairs],
-        counts,
-        mixture.log_prior,
-        math.log(mixture.eta),
-        log_factorial,
-        *_partitions(votes.argmax(axis=1)),
-        True,
+    # One partition for each subgoal, and room for as many as there are pairs.
+    subgoals, partition_of_pair = np.unique(votes.argmax(axis=1), return_inverse=True)
+    partition_of_pair, subgoals = _ascend(
+        _items(mixture, pairs, counts), partition_of_pair, np.resize(subgoals, len(pairs)), True
     )
-    partition_of, subgoal_of_partition = by_pair[0][index], by_pair[1]
+    partition_of = partition_of_pair[index]
     if mixture.eta * math.exp(mixture.log_prior.max()) > 1.0:
-        partition_of, subgoal_of_partition = _ascend(
-            mixture.log_likelihood[mixture.pair_of],
-            np.ones(len(start), dtype=np.int64),
-            mixture.log_prior,
-            math.log(mixture.eta),
-            log_factorial,
-            partition_of,
-            np.resize(subgoal_of_partition, len(start)),
-            False,
+        single = _items(mixture, mixture.pair_of, np.ones(len(start), dtype=np.int64))
+        partition_of, subgoals = _ascend(
+            single, partition_of, np.resize(subgoals, len(start)), False
         )
     labels, first, number = np.unique(partition_of, return_index=True, return_inverse=True)
     in_order = np.argsort(np.argsort(first))[number]
-    subgoals = subgoal_of_partition[labels]
     return Mode(
-        subgoal_of=subgoals[number].astype(np.int32),
+        subgoal_of=subgoals[partition_of].astype(np.int32),
         partition_of=in_order.astype(np.int32),
-        log_joint=mixture.log_joint(number, subgoals),
+        log_joint=mixture.log_joint(number, subgoals[labels]),
     )
 
 
-def _partitions(
-    subgoal_of: npt.NDArray[np.int64],
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """One partition for each subgoal: number of each item's, and subgoals with room for more."""
-    subgoals, partition_of = np.unique(subgoal_of, return_inverse=True)
-    return partition_of, np.resize(subgoals, len(subgoal_of))
+class _Items(NamedTuple):
+    """What moves as one: I items, each of some equal observations.
+
+    Attributes:
+        log_likelihood: (I, G) of one of an item's observations.
+        counts: (I,) int64 observations of each item.
+        log_prior: (G,).
+        log_eta: log of the concentration.
+        log_factorial: (N + 1,) log (n - 1)! by n, and 0 for n = 0.
+        best_alone: (I,) int64 best candidate for a partition of an item alone.
+        value_alone: (I,) what (10) gains by that partition.
+    """
+
+    log_likelihood: npt.NDArray[np.float64]
+    counts: npt.NDArray[np.int64]
+    log_prior: npt.NDArray[np.float64]
+    log_eta: float
+    log_factorial: npt.NDArray[np.float64]
+    best_alone: npt.NDArray[np.int64]
+    value_alone: npt.NDArray[np.float64]
+
+
+def _items(
+    mixture: SubgoalMixture, pairs: npt.NDArray[np.int64], counts: npt.NDArray[np.int64]
+) -> _Items:
+    """Items of so many observations of each of these rows of the mixture's likelihood."""
+    log_likelihood = mixture.log_likelihood[pairs]
+    log_factorial = np.array([0.0, *map(math.lgamma, range(1, counts.sum() + 1))])
+    alone = mixture.log_prior + counts[:, None] * log_likelihood
+    log_eta = math.log(mixture.eta)
+    return _Items(
+        log_likelihood=log_likelihood,
+        counts=counts,
+        log_prior=mixture.log_prior,
+        log_eta=log_eta,
+        log_factorial=log_factorial,
+        best_alone=alone.argmax(axis=1),
+        value_alone=alone.max(axis=1) + log_factorial[counts] + log_eta,
+    )
 
 
 @njit(nogil=True, cache=True)
-def _ascend(  # type: ignore[no-untyped-def]
-    log_likelihood, counts, log_prior, log_eta, log_factorial, partition_of, subgoals, whole
-):
-    """Ascent over items: `counts` (I,) equal observations each, with likelihoods (I, G).
+def _ascend(items, partition_of, subgoals, whole):  # type: ignore[no-untyped-def]
+    """Ascent from partitions numbered without gaps; returns others.
 
-    Partitions are numbered without gaps; `subgoals` (I,) holds theirs, then room for more. With
-    `whole`, whole partitions are given up, replaced and taken up too.
+    `subgoals` (I,) holds the partitions' subgoals, then room for more. With `whole`, whole
+    partitions are given up, replaced and taken up too.
     """
-    best_alone = np.empty(counts.shape[0], dtype=np.int64)
-    value_alone = np.empty(counts.shape[0])
-    for item in range(counts.shape[0]):
-        row = log_prior + counts[item] * log_likelihood[item]
-        best_alone[item] = row.argmax()
-        value_alone[item] = log_eta + row.max() + log_factorial[counts[item]]
-    model = (log_likelihood, counts, log_prior, log_eta, log_factorial, best_alone, value_alone)
     partition_of, subgoals = partition_of.copy(), subgoals.copy()
-    best = _climb(model, partition_of, subgoals)
+    best = _climb(items, partition_of, subgoals)
     gained = whole
     while gained:
         gained = False
         partition = 0
         while partition <= partition_of.max():
-            likely = _scores(model, partition_of, partition).argsort()[-_REPLACEMENTS:]
+            likely = _scores(items, partition_of, partition).argsort()[-_REPLACEMENTS:]
             for candidate in range(-1, likely.shape[0]):
                 trial, trial_subgoals = partition_of.copy(), subgoals.copy()
                 if candidate >= 0:
                     trial_subgoals[partition] = likely[candidate]
-                elif not _give_up(model, trial, trial_subgoals, partition):
+                elif not _give_up(items, trial, trial_subgoals, partition):
                     continue
-                value = _climb(model, trial, trial_subgoals)
+                value = _climb(items, trial, trial_subgoals)
                 if value > best + _GAIN:
                     best, partition_of, subgoals = value, trial, trial_subgoals
                     gained = True
                     break
             partition += 1
-        for candidate in range(log_prior.shape[0]):
+        for candidate in range(items.log_prior.shape[0]):
             trial, trial_subgoals = partition_of.copy(), subgoals.copy()
-            if _take_up(model, trial, trial_subgoals, candidate):
-                value = _climb(model, trial, trial_subgoals)
+            if _take_up(items, trial, trial_subgoals, candidate):
+                value = _climb(items, trial, trial_subgoals)
                 if value > best + _GAIN:
                     best, partition_of, subgoals = value, trial, trial_subgoals
                     gained = True
@@ -158,47 +171,46 @@ def _ascend(  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _sizes(model, partition_of):  # type: ignore[no-untyped-def]
+def _sizes(items, partition_of):  # type: ignore[no-untyped-def]
     """Observations in each partition, with room for as many partitions as items and one more."""
     sizes = np.zeros(partition_of.shape[0] + 1, dtype=np.int64)
     for item in range(partition_of.shape[0]):
-        sizes[partition_of[item]] += model[1][item]
+        sizes[partition_of[item]] += items.counts[item]
     return sizes
 
 
 @njit(nogil=True, cache=True)
-def _scores(model, partition_of, partition):  # type: ignore[no-untyped-def]
+def _scores(items, partition_of, partition):  # type: ignore[no-untyped-def]
     """(G,) log P(g) + sum over a partition of log P(O_i | g): log of (17) with its product."""
-    log_likelihood, counts, log_prior, _, _, _, _ = model
-    scores = log_prior.copy()
+    scores = items.log_prior.copy()
     for item in range(partition_of.shape[0]):
         if partition_of[item] == partition:
-            scores += counts[item] * log_likelihood[item]
+            scores += items.counts[item] * items.log_likelihood[item]
     return scores
 
 
 @njit(nogil=True, cache=True)
-def _climb(model, partition_of, subgoals):  # type: ignore[no-untyped-def]
+def _climb(items, partition_of, subgoals):  # type: ignore[no-untyped-def]
     """Items and partitions' subgoals in turn until nothing gains; (10) but for a constant."""
-    log_likelihood, counts, log_prior, log_eta, log_factorial, _, _ = model
-    sizes = _sizes(model, partition_of)
+    sizes = _sizes(items, partition_of)
     moved = True
     while moved:
         moved = False
         for item in range(partition_of.shape[0]):
-            moved = _move(model, partition_of, subgoals, sizes, item) or moved
+            moved = _move(items, partition_of, subgoals, sizes, item) or moved
         _close_gaps(partition_of, subgoals, sizes)
         for partition in range(partition_of.max() + 1):
-            scores = _scores(model, partition_of, partition)
+            scores = _scores(items, partition_of, partition)
             likeliest = scores.argmax()
             if scores[likeliest] > scores[subgoals[partition]] + _GAIN:
                 subgoals[partition] = likeliest
                 moved = True
     total = 0.0
     for partition in range(partition_of.max() + 1):
-        total += log_eta + log_prior[subgoals[partition]] + log_factorial[sizes[partition]]
+        total += items.log_eta + items.log_prior[subgoals[partition]]
+        total += items.log_factorial[sizes[partition]]
     for item in range(partition_of.shape[0]):
-        total += counts[item] * log_likelihood[item, subgoals[partition_of[item]]]
+        total += items.counts[item] * items.log_likelihood[item, subgoals[partition_of[item]]]
     return total
 
 
@@ -219,46 +231,44 @@ def _close_gaps(partition_of, subgoals, sizes):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _joining(model, subgoals, sizes, item, partition):  # type: ignore[no-untyped-def]
+def _joining(items, subgoals, sizes, item, partition):  # type: ignore[no-untyped-def]
     """What (10) gains when an item that is in no partition joins one, which may be empty."""
-    log_likelihood, counts, log_prior, log_eta, log_factorial, _, _ = model
-    count, size = counts[item], sizes[partition]
-    value = count * log_likelihood[item, subgoals[partition]] + log_factorial[size + count]
-    if size == 0:
-        return value + log_eta + log_prior[subgoals[partition]]
-    return value - log_factorial[size]
+    count, size = items.counts[item], sizes[partition]
+    value = count * items.log_likelihood[item, subgoals[partition]]
+    value += items.log_factorial[size + count] - items.log_factorial[size]
+    return value if size > 0 else value + items.log_eta + items.log_prior[subgoals[partition]]
 
 
 @njit(nogil=True, cache=True)
-def _move(model, partition_of, subgoals, sizes, item):  # type: ignore[no-untyped-def]
+def _move(items, partition_of, subgoals, sizes, item):  # type: ignore[no-untyped-def]
     """Move an item where (10) is largest; whether that gained."""
-    count, best_alone, value_alone = model[1][item], model[5][item], model[6][item]
+    count = items.counts[item]
     old = partition_of[item]
     sizes[old] -= count
-    stays = _joining(model, subgoals, sizes, item, old)
+    stays = _joining(items, subgoals, sizes, item, old)
     best, target = stays + _GAIN, old
     empty = -1
     for partition in range(partition_of.shape[0]):
         if sizes[partition] > 0:
-            value = _joining(model, subgoals, sizes, item, partition)
+            value = _joining(items, subgoals, sizes, item, partition)
             if value > best:
                 best, target = value, partition
         elif empty < 0:
             empty = partition
             if sizes[partition:].max() == 0:
                 break
-    if value_alone > best:
-        best, target = value_alone, empty
-        subgoals[target] = best_alone
+    if items.value_alone[item] > best:
+        best, target = items.value_alone[item], empty
+        subgoals[target] = items.best_alone[item]
     sizes[target] += count
     partition_of[item] = target
     return best > stays + _GAIN
 
 
 @njit(nogil=True, cache=True)
-def _give_up(model, partition_of, subgoals, given_up):  # type: ignore[no-untyped-def]
+def _give_up(items, partition_of, subgoals, given_up):  # type: ignore[no-untyped-def]
     """Move every item of a partition to the best of the others; whether there are others."""
-    sizes = _sizes(model, partition_of)
+    sizes = _sizes(items, partition_of)
     count = partition_of.max() + 1
     if count < 2:
         return False
@@ -267,10 +277,10 @@ def _give_up(model, partition_of, subgoals, given_up):  # type: ignore[no-untype
             best, target = -np.inf, -1
             for partition in range(count):
                 if partition != given_up:
-                    value = _joining(model, subgoals, sizes, item, partition)
+                    value = _joining(items, subgoals, sizes, item, partition)
                     if value > best:
                         best, target = value, partition
-            sizes[target] += model[1][item]
+            sizes[target] += items.counts[item]
             partition_of[item] = target
     sizes[given_up] = 0
     _close_gaps(partition_of, subgoals, sizes)
@@ -278,18 +288,17 @@ def _give_up(model, partition_of, subgoals, given_up):  # type: ignore[no-untype
 
 
 @njit(nogil=True, cache=True)
-def _take_up(model, partition_of, subgoals, candidate):  # type: ignore[no-untyped-def]
+def _take_up(items, partition_of, subgoals, candidate):  # type: ignore[no-untyped-def]
     """Gather in a new partition what `candidate` explains better; whether there is any."""
-    log_likelihood = model[0]
     new = partition_of.max() + 1
     if new == partition_of.shape[0]:
         return False
     taken = False
     for item in range(partition_of.shape[0]):
-        row = log_likelihood[item]
+        row = items.log_likelihood[item]
         if row[candidate] > row[subgoals[partition_of[item]]] + _GAIN:
             partition_of[item] = new
             taken = True
     subgoals[new] = candidate
-    _close_gaps(partition_of, subgoals, _sizes(model, partition_of))
+    _close_gaps(partition_of, subgoals, _sizes(items, partition_of))
     return taken
