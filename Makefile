@@ -23,7 +23,7 @@ endif
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 unexport AMENT_PREFIX_PATH PYTHONPATH PYTHONHOME RMW_IMPLEMENTATION
 
-.PHONY: help demo test lint unit bags venv clean
+.PHONY: help demo test lint unit bags benchmark venv clean
 
 help:  ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -43,6 +43,9 @@ unit: venv  ## Run the tests, without the checks of style and types
 
 bags: venv  ## Make the bags in bags/ again
 	$(BIN)/python -m bnirl_ros.experiments.make_bags --overcooked "$(OVERCOOKED)"
+
+benchmark: venv  ## Time the main job and its parts
+	$(BIN)/python benchmarks/main_job.py
 
 venv:  ## Make the virtual environment, or bring it up to date
 	@scripts/venv $(VENV)

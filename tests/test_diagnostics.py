@@ -39,6 +39,11 @@ def test_undefined_where_nothing_varies_or_there_is_one_chain() -> None:
     assert rhat(constant) is None
     assert effective_sample_size(constant) is None
     assert rhat(chains_of("slow", 1, 100)) is None
+    assert rhat(chains_of("slow", 4, 1)) is None
+    only_in_the_middle = np.zeros((2, 9))
+    only_in_the_middle[0, 4] = 1.0  # which split chains leave out
+    assert rhat(only_in_the_middle) is None
+    assert effective_sample_size(only_in_the_middle) is None
     assert rhat(chains_of("slow", 4, 7)) is None
     assert effective_sample_size(chains_of("slow", 4, 7)) is None
 

@@ -148,7 +148,7 @@ def test_ascent_never_loses_and_tells_its_log_joint(posterior: Posterior) -> Non
     _, mixture = paper_model(ROUND, MAP, QUICK)
     for draw in range(0, 200, 20):
         chain = posterior.draws[0]
-        mode = ascend(mixture, chain.subgoal_of[draw])
+        mode = ascend(mixture, chain.partition_of[draw], chain.subgoal_of[draw])
         assert mode.log_joint >= chain.log_joint[draw] - 1e-9
         _, first = np.unique(mode.partition_of, return_index=True)
         assert (np.diff(first) > 0).all()  # numbered by first observations

@@ -20,9 +20,9 @@ def rhat(values: npt.ArrayLike) -> float | None:
         None where it says nothing: one chain, fewer than eight draws, or no variance at all.
     """
     chains = np.asarray(values, dtype=np.float64)
-    if chains.shape[0] < 2 or chains.shape[1] < 8 or np.ptp(chains) == 0.0:
-        return None
     halves = _split(chains)
+    if len(chains) < 2 or halves.shape[1] < 4 or np.ptp(halves) == 0.0:
+        return None
     bulk = _plain_rhat(_rank_normalised(halves))
     tail = _plain_rhat(_rank_normalised(np.abs(halves - np.median(halves))))
     return max(bulk, tail)
@@ -39,10 +39,10 @@ def effective_sample_size(values: npt.ArrayLike) -> float | None:
     Returns:
         None for fewer than eight draws, or no variance.
     """
-    chains = np.asarray(values, dtype=np.float64)
-    if chains.shape[1] < 8 or np.ptp(chains) == 0.0:
+    halves = _split(np.asarray(values, dtype=np.float64))
+    if halves.shape[1] < 4 or np.ptp(halves) == 0.0:
         return None
-    split = _rank_normalised(_split(chains))
+    split = _rank_normalised(halves)
     count, length = split.shape
     covariance = _autocovariance(split)
     within = covariance[:, 0].mean() * length / (length - 1.0)
@@ -62,8 +62,8 @@ def effective_sample_size(values: npt.ArrayLike) -> float | None:
 
 def _split(chains: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Each chain's halves as chains of their own; a middle draw is left out."""
-    half = chains.shape[1] // 2
-    return np.concatenate([chains[:, :half], chains[:, -half:]])
+    length = chains.shape[1]
+    return np.concatenate([chains[:, : length // 2], chains[:, length - length // 2 :]])
 
 
 def _rank_normalised(chains: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -45,20 +45,22 @@ def posterior_mode(mixture: SubgoalMixture, chains: Draws) -> Mode:
         mixture: the model that was sampled.
         chains: draws with leading axes (chain, draw).
     """
-    starts = np.unique(
-        [
-            chains.subgoal_of[chain, best]
-            for chain, best in enumerate(chains.log_joint.argmax(axis=1))
-        ],
-        axis=0,
-    )
-    with ThreadPoolExecutor(min(len(starts), os.cpu_count() or 1)) as threads:
-        modes = list(threads.map(lambda start: ascend(mixture, start), starts))
-    return max(modes, key=lambda mode: mode.log_joint)
+    best = chains.log_joint.argmax(axis=1)
+    with ThreadPoolExecutor(min(len(best), os.cpu_count() or 1)) as threads:
+        modes = threads.map(
+            lambda chain, draw: ascend(
+                mixture, chains.partition_of[chain, draw], chains.subgoal_of[chain, draw]
+            ),
+            range(len(best)),
+            best,
+        )
+        return max(modes, key=lambda mode: mode.log_joint)
 
 
-def ascend(mixture: SubgoalMixture, subgoal_of: npt.ArrayLike) -> Mode:
-    """Coordinate ascent on (10) from each observation's subgoal (N,), one partition for each.
+def ascend(
+    mixture: SubgoalMixture, partition_of: npt.ArrayLike, subgoal_of: npt.ArrayLike
+) -> Mode:
+    """Coordinate ascent on (10) from a draw: partition and subgoal of each observation (N,).
 
     Equal observations move together, in turn until nothing gains: all equal ones to the best
     partition, old or new; each partition's subgoal; a whole partition given up, or its subgoal
@@ -66,28 +68,40 @@ def ascend(mixture: SubgoalMixture, subgoal_of: npt.ArrayLike) -> Mode:
 
     Apart, equal observations would gain only where eta P(g) > 1 for some g: as (10) is convex in
     how many of them are in one partition rather than in another, either all are or none, and only
-    a new partition for a single one could be better than for all. There single ones move too.
+    a new partition for a single one could be better than for all. There single ones move too,
+    from that point and from the draw itself.
     """
-    start = np.asarray(subgoal_of, dtype=np.int64)
+    subgoal_of = np.asarray(subgoal_of, dtype=np.int64)
     pairs, index, counts = np.unique(mixture.pair_of, return_inverse=True, return_counts=True)
     votes = np.zeros((len(pairs), len(mixture.log_prior)), dtype=np.int64)
-    np.add.at(votes, (index, start), 1)
+    np.add.at(votes, (index, subgoal_of), 1)
     # One partition for each subgoal, and room for as many as there are pairs.
     subgoals, partition_of_pair = np.unique(votes.argmax(axis=1), return_inverse=True)
     partition_of_pair, subgoals = _ascend(
         _items(mixture, pairs, counts), partition_of_pair, np.resize(subgoals, len(pairs)), True
     )
-    partition_of = partition_of_pair[index]
-    if mixture.eta * math.exp(mixture.log_prior.max()) > 1.0:
-        single = _items(mixture, mixture.pair_of, np.ones(len(start), dtype=np.int64))
-        partition_of, subgoals = _ascend(
-            single, partition_of, np.resize(subgoals, len(start)), False
-        )
+    mode = _mode(mixture, partition_of_pair[index], subgoals)
+    if mixture.eta * math.exp(mixture.log_prior.max()) <= 1.0:
+        return mode
+    single = _items(mixture, mixture.pair_of, np.ones(len(index), dtype=np.int64))
+    modes = [mode]
+    for partitions, goals in ((mode.partition_of, mode.subgoal_of), (partition_of, subgoal_of)):
+        _, first, number = np.unique(partitions, return_index=True, return_inverse=True)
+        room = np.resize(np.asarray(goals, dtype=np.int64)[first], len(index))
+        modes.append(_mode(mixture, *_ascend(single, number, room, False)))
+    return max(modes, key=lambda mode: mode.log_joint)
+
+
+def _mode(
+    mixture: SubgoalMixture,
+    partition_of: npt.NDArray[np.int64],
+    subgoals: npt.NDArray[np.int64],
+) -> Mode:
+    """From partitions (N,) in any numbers, and the subgoal of each number."""
     labels, first, number = np.unique(partition_of, return_index=True, return_inverse=True)
-    in_order = np.argsort(np.argsort(first))[number]
     return Mode(
         subgoal_of=subgoals[partition_of].astype(np.int32),
-        partition_of=in_order.astype(np.int32),
+        partition_of=np.argsort(np.argsort(first))[number].astype(np.int32),
         log_joint=mixture.log_joint(number, subgoals[labels]),
     )
 
@@ -196,8 +210,13 @@ def _climb(items, partition_of, subgoals):  # type: ignore[no-untyped-def]
     moved = True
     while moved:
         moved = False
+        bound = partition_of.max() + 1
         for item in range(partition_of.shape[0]):
-            moved = _move(items, partition_of, subgoals, sizes, item) or moved
+            old = partition_of[item]
+            _move(items, partition_of, subgoals, sizes, item, bound)
+            if partition_of[item] != old:
+                moved = True
+                bound = max(bound, partition_of[item] + 1)
         _close_gaps(partition_of, subgoals, sizes)
         for partition in range(partition_of.max() + 1):
             scores = _scores(items, partition_of, partition)
@@ -240,29 +259,24 @@ def _joining(items, subgoals, sizes, item, partition):  # type: ignore[no-untype
 
 
 @njit(nogil=True, cache=True)
-def _move(items, partition_of, subgoals, sizes, item):  # type: ignore[no-untyped-def]
-    """Move an item where (10) is largest; whether that gained."""
-    count = items.counts[item]
+def _move(items, partition_of, subgoals, sizes, item, bound):  # type: ignore[no-untyped-def]
+    """Move an item where (10) is largest; partitions from `bound` on are empty."""
     old = partition_of[item]
-    sizes[old] -= count
-    stays = _joining(items, subgoals, sizes, item, old)
-    best, target = stays + _GAIN, old
+    sizes[old] -= items.counts[item]
+    best, target = _joining(items, subgoals, sizes, item, old) + _GAIN, old
     empty = -1
-    for partition in range(partition_of.shape[0]):
-        if sizes[partition] > 0:
+    for partition in range(bound + 1):
+        if sizes[partition] == 0:
+            empty = partition if empty < 0 else empty
+        else:
             value = _joining(items, subgoals, sizes, item, partition)
             if value > best:
                 best, target = value, partition
-        elif empty < 0:
-            empty = partition
-            if sizes[partition:].max() == 0:
-                break
     if items.value_alone[item] > best:
-        best, target = items.value_alone[item], empty
+        target = empty
         subgoals[target] = items.best_alone[item]
-    sizes[target] += count
+    sizes[target] += items.counts[item]
     partition_of[item] = target
-    return best > stays + _GAIN
 
 
 @njit(nogil=True, cache=True)

@@ -1,0 +1,82 @@
+"""How long the main job takes: from a bag to the result files, and what its parts take.
+
+    make benchmark
+
+Times are wall-clock; compare runs on one machine only. Kernels are compiled and cached first.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+from bnirl_ros.bags.demonstration import read_demonstration
+from bnirl_ros.demonstrations.placement import place
+from bnirl_ros.inference.chains import run_chains
+from bnirl_ros.inference.mode import posterior_mode
+from bnirl_ros.inference.posterior import infer, paper_model
+from bnirl_ros.inference.settings import Settings
+from bnirl_ros.mdp.goal_values import goal_values
+from bnirl_ros.mdp.grid_world import GridWorld
+from bnirl_ros.resources import share_folder
+
+BAGS = {"paper_loop": Settings(), "overcooked_random3": Settings(alpha=5.0)}
+
+
+def timed(what: str, runs: int, run: Callable[[], object]) -> None:
+    """Print minimum, median and maximum of several runs, after one that doesn't count."""
+    run()
+    times = []
+    for _ in range(runs):
+        start = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - start)
+    print(f"{what:40s} {min(times):8.3f} {median(times):8.3f} {max(times):8.3f}", flush=True)
+
+
+def command(bag: Path, settings: Settings, out: Path) -> None:
+    """`bnirl infer` as a process of its own, start of the interpreter included."""
+    arguments = ["infer", str(bag), "--out", str(out), "--alpha", str(settings.alpha)]
+    subprocess.run(
+        [sys.executable, "-m", "bnirl_ros.cli", *arguments], check=True, stdout=subprocess.DEVNULL
+    )
+
+
+def benchmark_bag(name: str, settings: Settings) -> None:
+    """The parts of `bnirl infer` on a shipped bag, and the whole."""
+    bag = share_folder() / "bags" / name
+    recorded = read_demonstration(bag, {})
+    assert recorded.grid_map is not None
+    grid_map = recorded.grid_map
+    demonstration = place(recorded.recording, grid_map).demonstration
+    _, mixture = paper_model(demonstration, grid_map, settings)
+    draws = run_chains(mixture, settings)
+    print(f"{name}: {len(demonstration)} observations")
+    timed("  read", 5, lambda: read_demonstration(bag, {}))
+    timed("  4 chains of 1000 sweeps", 5, lambda: run_chains(mixture, settings))
+    timed("  mode", 5, lambda: posterior_mode(mixture, draws))
+    with tempfile.TemporaryDirectory() as out:
+        timed("  bnirl infer, as a process", 5, lambda: command(bag, settings, Path(out)))
+    posterior = infer(demonstration, grid_map, settings)
+    print(f"  R-hat {posterior.rhat:.3f}, effective sample size {posterior.ess:.0f}")
+
+
+def main() -> None:
+    """Print a table of seconds."""
+    print(f"{'':40s} {'least':>8s} {'median':>8s} {'most':>8s}  [s]")
+    world = GridWorld(np.ones((20, 20), dtype=bool))
+    states = np.arange(400)
+    timed("100 goals on 20 x 20 cells", 20, lambda: goal_values(world, states[:100], states))
+    for name, settings in BAGS.items():
+        benchmark_bag(name, settings)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""Kernels stay within their arrays: the same work, with numba's checks of bounds compiled in."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+PROGRAM = """
+import numpy as np
+from bnirl_ros.demonstrations.demonstration import Demonstration
+from bnirl_ros.inference.mode import ascend
+from bnirl_ros.inference.posterior import infer
+from bnirl_ros.inference.settings import Settings
+from bnirl_ros.maps.grid_map import GridMap
+from bnirl_ros.mdp.finite_mdp import FiniteMDP
+from bnirl_ros.mdp.goal_values import goal_values
+from bnirl_ros.mdp.grid_world import GridWorld
+
+for seed in range(60):
+    generator = np.random.default_rng(seed)
+    free = generator.random((1 + seed % 4, 1 + seed % 5)) < 0.8
+    free.flat[seed % free.size] = True
+    y, x = np.nonzero(free)
+    count = int(generator.integers(1, 12))
+    at = generator.integers(len(x), size=count)
+    moves = (4, 8)[seed % 2]
+    actions = GridWorld(free, moves).actions
+    demonstration = Demonstration(
+        episode=np.zeros(count, dtype=np.int64),
+        cells=np.column_stack([x, y])[at],
+        action=generator.choice(actions, size=count),
+        last_episode=np.zeros(0, dtype=np.int64),
+        last_cells=np.zeros((0, 2), dtype=np.int64),
+    )
+    eta = float(10.0 ** generator.uniform(-2, 4))
+    alpha = float(10.0 ** generator.uniform(-1, 2))
+    settings = Settings(
+        alpha=alpha, eta=eta, moves=moves, sweeps=30, burn_in=5, chains=2,
+        candidates=("visited", "free")[seed % 3 == 0],
+    )
+    posterior = infer(demonstration, GridMap(free), settings)
+    assert np.isfinite(posterior.draws.log_joint).all()
+    assert posterior.mode.log_joint >= posterior.draws.log_joint.max() - 1e-9
+    if seed < 5:
+        world = GridWorld(free, moves)
+        goals = world.states_of(np.column_stack([x, y]))
+        mdp = FiniteMDP.from_transitions(world.transitions(), 0.9)
+        goal_values(mdp, goals, np.arange(world.state_count))
+print("within bounds")
+"""
+
+
+def test_kernels_stay_within_their_arrays(tmp_path: Path) -> None:
+    root = Path(__file__).resolve().parent.parent
+    environment = {
+        **os.environ,
+        "NUMBA_BOUNDSCHECK": "1",
+        "NUMBA_CACHE_DIR": str(tmp_path),  # not the kernels that were compiled without checks
+        "PYTHONPATH": str(root),
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM], capture_output=True, text=True, env=environment
+    )
+    assert done.stdout == "within bounds\n", done.stderr
