@@ -64,6 +64,7 @@ class BackgroundInference:
         self._changed = False
         self._paused = False
         self._closed = False
+        self._at_work = False
         self._requests: list[tuple[Future[Result], Callable[[Result], None] | None]] = []
         self._result: Result | None = None
         self._running: RunningPosterior | None = None
@@ -98,9 +99,9 @@ class BackgroundInference:
 
     @property
     def idle(self) -> bool:
-        """Whether there is nothing to do."""
+        """Whether there is nothing to do, and all that was done can be taken."""
         with self._wake:
-            return not self._has_work()
+            return not self._at_work and not self._has_work()
 
     def reset(self) -> None:
         """Forget the chains; the recorder was cleared."""
@@ -147,7 +148,9 @@ class BackgroundInference:
     def _run(self) -> None:
         while True:
             with self._wake:
+                self._at_work = False
                 self._wake.wait_for(self._has_work)
+                self._at_work = True
                 if self._closed:
                     for waiting, _ in self._requests:
                         waiting.cancel()
