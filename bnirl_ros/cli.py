@@ -27,8 +27,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # A command lives so short that collecting garbage, while libraries are imported and again at
     # the end, would be a fifth of its time.
     gc.disable()
+    given = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        options = _parser().parse_args(arguments)
+        if given[:1] == ["replay"]:  # its options are replay_node's, which argparse cannot know
+            return _replay(given[1:])
+        options = _parser().parse_args(given)
         return int(options.run(options))
     except InputError as error:
         print(f"bnirl: {error}", file=sys.stderr)
@@ -67,11 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_settings(infer)
     infer.set_defaults(run=_infer, command=infer)
 
-    replay = commands.add_parser(
-        "replay", help="play a recorded demonstration onto its topics", add_help=False
-    )
-    replay.add_argument("arguments", nargs=argparse.REMAINDER)
-    replay.set_defaults(run=_replay)
+    commands.add_parser("replay", help="play a recorded demonstration onto its topics")
 
     demo = commands.add_parser("demo", help="watch a human demonstration become subgoals")
     demo.add_argument("--bag", type=Path, help="another bag than the human demonstration")
@@ -149,12 +148,12 @@ def _infer(options: argparse.Namespace) -> int:
     return 0
 
 
-def _replay(options: argparse.Namespace) -> int:
+def _replay(arguments: Sequence[str]) -> int:
     """`bnirl replay`: the same as replay_node."""
     _needs_ros()
     from bnirl_ros.nodes.replay_node import main as replay
 
-    return replay(options.arguments)
+    return replay(arguments)
 
 
 def _demo(options: argparse.Namespace) -> int:
