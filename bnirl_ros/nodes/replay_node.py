@@ -13,7 +13,6 @@ from typing import Any
 
 import rclpy
 from rclpy.duration import Duration
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.utilities import remove_ros_args
@@ -32,7 +31,7 @@ _DEPTH = 1000  # of a reliable publisher at least that plays at a pace
 # acknowledgement (and has it in some 6 ms); otherwise it asks every three seconds only. And it is
 # small: what overflows the transport is sent again at 256 messages in three seconds.
 _ROUND = 50
-_LOOK_PERIOD = 0.05  # [s] between two looks at whether to stop
+_LOOK_PERIOD = 0.05  # [s] between two looks at subscribers, and at whether to stop
 _STUCK_AFTER = 10.0  # [s] without acknowledgement after which a subscriber is given up
 
 
@@ -84,7 +83,7 @@ class ReplayNode(Node):
             if time.monotonic() > tell_at:
                 self.get_logger().info(f"waits for a subscriber of {', '.join(missing)}")
                 tell_at = deadline
-            _rest(_LOOK_PERIOD)
+            time.sleep(_LOOK_PERIOD)
 
     def publish_map(self, path: Path) -> None:
         """Publish a map file on /map, latched.
@@ -114,8 +113,7 @@ class ReplayNode(Node):
                 start = (time.monotonic(), message.log_time)
             if self._rate is not None:
                 due = start[0] + (message.log_time - start[1]) / 1e9 / self._rate
-                while (left := due - time.monotonic()) > 0.0:
-                    _rest(min(left, _LOOK_PERIOD))
+                time.sleep(max(0.0, due - time.monotonic()))
             publisher.publish(message.data)
             self.sent[message.topic] += 1
             if self._rate is None and self.sent[message.topic] % _ROUND == 0:
@@ -128,7 +126,6 @@ class ReplayNode(Node):
         publisher = self._topic_publishers[topic]
         deadline = time.monotonic() + _STUCK_AFTER
         while not publisher.wait_for_all_acked(Duration(seconds=_LOOK_PERIOD)):
-            _rest(0.0)
             if time.monotonic() > deadline:
                 self.get_logger().warning(
                     f"a subscriber of {topic} doesn't acknowledge; goes on without it",
@@ -250,13 +247,6 @@ def _positive(text: str) -> float:
     if not 0.0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"must be above 0, not {text}")
     return value
-
-
-def _rest(seconds: float) -> None:
-    """Sleep, unless the process was told to end."""
-    if not rclpy.ok():
-        raise ExternalShutdownException
-    time.sleep(seconds)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
