@@ -86,8 +86,8 @@ setup(
     entry_points={
         "console_scripts": [
             "bnirl = bnirl_ros.cli:main",
-            "replay_node = bnirl_ros.nodes.replay_node:main",
-            "subgoal_node = bnirl_ros.nodes.subgoal_node:main",
+            "replay_node = bnirl_ros.nodes.start:replay_node",
+            "subgoal_node = bnirl_ros.nodes.start:subgoal_node",
         ],
     },
 )

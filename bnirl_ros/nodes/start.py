@@ -1,0 +1,25 @@
+"""The executables of `ros2 run`: they end quietly also while what they need is being imported."""
+
+from __future__ import annotations
+
+import os
+import signal
+from importlib import import_module
+
+
+def subgoal_node() -> int:
+    """Run the subgoal node; returns the exit status."""
+    return _main_of("subgoal_node")
+
+
+def replay_node() -> int:
+    """Run the replay node; returns the exit status."""
+    return _main_of("replay_node")
+
+
+def _main_of(module: str) -> int:
+    # An exception can get lost in an import; and there is nothing yet to clean up. Each node's
+    # main puts its own handlers in place of these.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: os._exit(0))
+    return int(import_module(f"bnirl_ros.nodes.{module}").main())
