@@ -52,11 +52,7 @@ def read_demonstration(path: Path, remappings: Mapping[str, str]) -> RecordedDem
     for name, type_name in TOPIC_TYPES.items():
         recorded = types.get(names[name])
         if recorded is None and name != "map":
-            there = ", ".join(f"{topic} ({kind})" for topic, kind in types.items()) or "none"
-            raise InputError(
-                f"{path}: has no topic {names[name]} ({type_name}), only {there}; "
-                f"name the right one with --remap {name}:=/topic"
-            )
+            raise InputError(_without(names[name], name, types, bag))
         if recorded not in (None, type_name):
             raise InputError(
                 f"{path}: topic {names[name]} is of type {recorded}, not {type_name}; "
@@ -85,6 +81,20 @@ def read_demonstration(path: Path, remappings: Mapping[str, str]) -> RecordedDem
         faults=faults + recorder.faults,
         warnings=tuple(bag.warnings),
         damage=bag.damage,
+    )
+
+
+def _without(topic: str, name: str, types: Mapping[str, str], bag: Bag) -> str:
+    """The sentence on a bag that lacks a topic, or whose damage hides it."""
+    wanted = f"{topic} ({TOPIC_TYPES[name]})"
+    if bag.damage:
+        return f"{bag.damage}, and no topic {wanted} was found; name a sound bag"
+    if not types:
+        return f"{bag.path}: has no topic at all; name a bag with the topic {wanted}"
+    there = ", ".join(f"{topic} ({kind})" for topic, kind in types.items())
+    return (
+        f"{bag.path}: has no topic {wanted}, only {there}; "
+        f"name the right one with --remap {name}:=/topic"
     )
 
 
