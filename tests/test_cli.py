@@ -1,0 +1,649 @@
+"""The command `bnirl infer` as its users meet it: what it reads, writes, says, and ends with."""
+
+from __future__ import annotations
+
+import csv
+import gc
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+from PIL import Image
+
+import bnirl_ros
+from bnirl_ros import cli
+from bnirl_ros.bags import writer as bag_writer
+from bnirl_ros.experiments.scenarios import PAPER_LOOP, shipped_demonstration
+from bnirl_ros.inference.settings import Settings
+from bnirl_ros.maps import GridMap, occupancy_of, parse_text_grid
+from bnirl_ros.mdp.actions import ACTION_NAMES
+from demonstration_support import (
+    BAD_COUNTS,
+    BAGS,
+    CORNERS,
+    GRID,
+    MAP,
+    OBSERVATIONS_OF_WALK,
+    SECOND,
+    START,
+    action_of,
+    bad_maps,
+    bad_messages,
+    map_of_grid,
+    mcap_of,
+    pose_at,
+    walk,
+    write_bag,
+)
+
+pytestmark = pytest.mark.timeout(180)
+
+PAPER_BAG = BAGS / PAPER_LOOP.name
+QUICK = ("--sweeps", "60", "--burn-in", "20")
+FILES = ["posterior.npz", "subgoals.json", "subgoals.png"]
+ARRAYS = {
+    "candidates",
+    "observations",
+    "subgoal_of",
+    "partition_of",
+    "log_joint",
+    "mode_subgoal_of",
+    "mode_partition_of",
+}
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a command ended, and what it said."""
+
+    status: int
+    out: str
+    err: str
+
+    @property
+    def lines(self) -> list[str]:
+        """Those on standard error."""
+        return self.err.splitlines()
+
+
+Command = Callable[..., Ended]
+
+
+def in_process(*arguments: str | Path, cwd: Path | None = None) -> subprocess.Popen[str]:
+    """The command in a process of its own, not waited for."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "bnirl_ros.cli", *map(str, arguments)],
+        cwd=cwd,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(Path(bnirl_ros.__file__).parents[1])},
+    )
+
+
+def ended(process: subprocess.Popen[str]) -> Ended:
+    try:
+        out, err = process.communicate(timeout=120)
+    finally:
+        process.kill()
+    return Ended(process.returncode, out, err)
+
+
+@pytest.fixture
+def bnirl(capsys: pytest.CaptureFixture[str]) -> Iterator[Command]:
+    """The command, called in this process, which is a second quicker."""
+
+    def call(*arguments: str | Path) -> Ended:
+        try:
+            status = cli.main([str(argument) for argument in arguments])
+        except SystemExit as end:  # argparse
+            status = int(end.code or 0)
+        return Ended(status, *capsys.readouterr())
+
+    yield call
+    gc.unfreeze()  # the command lives as long as its process: it has no use for the collector
+    gc.enable()
+
+
+def document_in(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "subgoals.json").read_text(encoding="utf-8"))
+
+
+def arrays_in(folder: Path) -> dict[str, np.ndarray]:
+    with np.load(folder / "posterior.npz", allow_pickle=False) as archive:
+        return dict(archive)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """The bytes of the results that are the same for the same posterior."""
+    return {name: (folder / name).read_bytes() for name in FILES[:2]}
+
+
+def cells_in(folder: Path) -> set[tuple[int, ...]]:
+    return {tuple(subgoal["cell"]) for subgoal in document_in(folder)["subgoals"]}
+
+
+@pytest.fixture(scope="module")
+def default_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Ended, Path]:
+    """`bnirl infer bags/paper_loop` without any option, as a process; and its working folder."""
+    folder = tmp_path_factory.mktemp("default")
+    return ended(in_process("infer", PAPER_BAG, cwd=folder)), folder
+
+
+@pytest.fixture
+def walk_bag(tmp_path: Path) -> Path:
+    return write_bag(tmp_path / "walk", [map_of_grid(), *walk()])
+
+
+# What it writes
+
+
+def test_three_files_a_table_and_status_0(default_run: tuple[Ended, Path]) -> None:
+    end, folder = default_run
+    assert (end.status, end.err) == (0, "")
+    assert sorted(path.name for path in (folder / "bnirl_out").iterdir()) == FILES
+    assert end.out.splitlines()[0].split()[:2] == ["rank", "cell"]
+    assert all(f"bnirl_out/{name}" in end.out for name in FILES)
+    for x, y in PAPER_LOOP.subgoals:
+        assert f"({x}, {y})" in end.out
+
+
+def test_subgoals_json_is_the_contract(default_run: tuple[Ended, Path]) -> None:
+    folder = default_run[1] / "bnirl_out"
+    document, arrays = document_in(folder), arrays_in(folder)
+    assert list(document) == [
+        "format",
+        "frame_id",
+        "resolution",
+        "model",
+        "subgoals",
+        "diagnostics",
+    ]
+    assert (document["format"], document["frame_id"], document["resolution"]) == (1, "map", 1.0)
+    assert document["model"] == {
+        "name": "paper",
+        "alpha": 50.0,
+        "eta": 1.0,
+        "discount": 0.99,
+        "success": 0.7,
+    }
+    assert set(document["diagnostics"]) == {"rhat", "ess", "chains", "draws"}
+    assert document["diagnostics"]["chains"] == 4
+    assert document["diagnostics"]["draws"] == 800
+    assert 0.99 < document["diagnostics"]["rhat"] < 1.05
+    assert 100 < document["diagnostics"]["ess"] <= 4000
+
+    subgoals = document["subgoals"]
+    candidates, counts = np.unique(arrays["mode_subgoal_of"], return_counts=True)
+    cells = arrays["candidates"][candidates].tolist()
+    count_of = dict(zip(map(tuple, cells), counts.tolist(), strict=True))
+    index_of = dict(zip(map(tuple, cells), candidates.tolist(), strict=True))
+    assert [subgoal["rank"] for subgoal in subgoals] == list(range(1, len(subgoals) + 1))
+    assert {tuple(subgoal["cell"]) for subgoal in subgoals} == set(count_of)
+    assert set(count_of) == set(PAPER_LOOP.subgoals)
+    observations = [subgoal["observations"] for subgoal in subgoals]
+    assert observations == sorted(observations, reverse=True)
+    for subgoal in subgoals:
+        assert set(subgoal) == {
+            "rank",
+            "cell",
+            "position",
+            "probability",
+            "observations",
+            "visit_order",
+        }
+        cell = tuple(subgoal["cell"])
+        assert subgoal["position"] == [cell[0] + 0.5, cell[1] + 0.5]
+        assert subgoal["observations"] == count_of[cell]
+        occurs = (arrays["subgoal_of"] == index_of[cell]).any(axis=2)
+        assert subgoal["probability"] == pytest.approx(occurs.mean())
+    order = {tuple(subgoal["cell"]): subgoal["visit_order"] for subgoal in subgoals}
+    assert [order[cell] for cell in PAPER_LOOP.subgoals] == [[1], [2], [3], [4]]
+
+
+def test_posterior_npz_is_the_contract(default_run: tuple[Ended, Path]) -> None:
+    arrays = arrays_in(default_run[1] / "bnirl_out")
+    demonstration = shipped_demonstration(PAPER_LOOP)
+    count, candidates = len(demonstration), len(arrays["candidates"])
+    shapes = {name: values.shape for name, values in arrays.items()}
+    assert shapes == {
+        "candidates": (candidates, 2),
+        "observations": (count, 4),
+        "subgoal_of": (4, 800, count),
+        "partition_of": (4, 800, count),
+        "log_joint": (4, 800),
+        "mode_subgoal_of": (count,),
+        "mode_partition_of": (count,),
+    }
+    assert arrays["subgoal_of"].dtype == arrays["partition_of"].dtype == np.int32
+    assert arrays["log_joint"].dtype == np.float64
+    assert all(arrays[name].dtype.kind == "i" for name in ARRAYS - {"log_joint"})
+
+    np.testing.assert_array_equal(arrays["observations"], demonstration.observations)
+    visited = {tuple(cell) for cell in demonstration.cells.tolist()}
+    visited |= {tuple(cell) for cell in demonstration.last_cells.tolist()}
+    assert sorted(map(tuple, arrays["candidates"].tolist())) == sorted(visited)
+    assert arrays["subgoal_of"].min() >= 0
+    assert arrays["subgoal_of"].max() < candidates
+    assert np.isfinite(arrays["log_joint"]).all()
+
+    # A partition has one subgoal; the numbers of partitions start from 0 and leave none out.
+    mode = np.stack([arrays["mode_partition_of"], arrays["mode_subgoal_of"]])
+    last = np.stack([arrays["partition_of"][-1, -1], arrays["subgoal_of"][-1, -1]])
+    for partition_of, subgoal_of in (mode, last):
+        pairs = {*zip(partition_of.tolist(), subgoal_of.tolist(), strict=True)}
+        assert sorted(partition for partition, _ in pairs) == list(range(len(pairs)))
+
+
+def test_subgoals_png_is_a_picture(default_run: tuple[Ended, Path]) -> None:
+    with Image.open(default_run[1] / "bnirl_out" / "subgoals.png") as picture:
+        picture.load()
+        assert picture.format == "PNG"
+        assert min(picture.size) > 300
+        assert len(picture.convert("RGB").getcolors(maxcolors=2**24)) > 10
+
+
+def test_the_defaults_are_those_of_the_contract(
+    default_run: tuple[Ended, Path], bnirl: Command, tmp_path: Path
+) -> None:
+    spelt_out = {
+        "model": "paper",
+        "alpha": 50,
+        "eta": 1,
+        "sweeps": 1000,
+        "burn-in": 200,
+        "thin": 1,
+        "chains": 4,
+        "seed": 0,
+        "success": 0.7,
+        "discount": 0.99,
+        "moves": 8,
+        "candidates": "visited",
+    }
+    options = [f"--{name}={value}" for name, value in spelt_out.items()]
+    assert bnirl("infer", PAPER_BAG, "--out", tmp_path, *options).status == 0
+    assert contents(tmp_path) == contents(default_run[1] / "bnirl_out")
+
+
+def test_settings_count(bnirl: Command, walk_bag: Path, tmp_path: Path) -> None:
+    model = ["--alpha=20", "--eta=0.5", "--success=0.9", "--discount=0.95", "--candidates=free"]
+    sampling = ["--sweeps=50", "--burn-in=10", "--thin=4", "--chains=1"]
+    assert bnirl("infer", walk_bag, "--out", tmp_path, *model, *sampling).status == 0
+    document, arrays = document_in(tmp_path), arrays_in(tmp_path)
+    assert document["model"] == {
+        "name": "paper",
+        "alpha": 20.0,
+        "eta": 0.5,
+        "discount": 0.95,
+        "success": 0.9,
+    }
+    assert document["diagnostics"]["rhat"] is None  # a single chain has none
+    assert arrays["subgoal_of"].shape == (1, 10, OBSERVATIONS_OF_WALK)
+    assert len(arrays["candidates"]) == MAP.free.sum()
+
+
+# The same posterior, whatever is in between
+
+
+def test_the_same_seed_gives_the_same_bytes_on_any_number_of_cores(
+    bnirl: Command, walk_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results = []
+    for number, cores in enumerate((1, 2, 16)):
+        monkeypatch.setattr(os, "cpu_count", lambda cores=cores: cores)
+        out = tmp_path / str(number)
+        assert bnirl("infer", walk_bag, "--out", out, *QUICK, "--seed", "7").status == 0
+        results.append(contents(out))
+    assert results[0] == results[1] == results[2]
+    assert ended(in_process("infer", walk_bag, "--out", out, *QUICK, "--seed", "7")).status == 0
+    assert contents(out) == results[0]
+    assert bnirl("infer", walk_bag, "--out", out, *QUICK, "--seed", "8").status == 0
+    assert contents(out)["posterior.npz"] != results[0]["posterior.npz"]
+
+
+def write_csv(path: Path, observations: np.ndarray) -> Path:
+    with path.open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(["episode", "x", "y", "action"])
+        for episode, x, y, action in observations.tolist():
+            table.writerow([episode, x, y, ACTION_NAMES[action]])
+    return path
+
+
+def write_nav2_map(folder: Path, grid_map: GridMap) -> Path:
+    height, width = grid_map.free.shape
+    occupancy = occupancy_of(grid_map).reshape(height, width)[::-1]
+    Image.fromarray(np.where(occupancy > 0, 0, 254).astype(np.uint8)).save(folder / "map.pgm")
+    path = folder / "map.yaml"
+    path.write_text(
+        "image: map.pgm\nresolution: 1.0\norigin: [0.0, 0.0, 0.0]\nnegate: 0\n"
+        "occupied_thresh: 0.65\nfree_thresh: 0.25\n"
+    )
+    return path
+
+
+def test_folder_file_and_csv_with_either_map_are_the_same_demonstration(
+    bnirl: Command, tmp_path: Path
+) -> None:
+    text_grid = tmp_path / "map.txt"
+    text_grid.write_text(PAPER_LOOP.grid.strip() + "\n")
+    nav2_map = write_nav2_map(tmp_path, PAPER_LOOP.grid_map)
+    table = write_csv(tmp_path / "demo.csv", shipped_demonstration(PAPER_LOOP).observations)
+    results = []
+    for number, arguments in enumerate(
+        [
+            (PAPER_BAG,),
+            (mcap_of(PAPER_BAG),),
+            (mcap_of(PAPER_BAG), "--map", nav2_map),
+            (table, "--map", text_grid),
+            (table, "--map", nav2_map),
+        ]
+    ):
+        out = tmp_path / str(number)
+        end = bnirl("infer", *arguments, "--out", out, *QUICK)
+        assert (end.status, end.err) == (0, "")
+        results.append(contents(out))
+    # The loop's last poses, which a CSV file does not tell, are visited otherwise as well.
+    assert all(result == results[0] for result in results)
+
+
+def test_a_remapped_topic_is_read(bnirl: Command, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", [map_of_grid(), *walk()], prefix="/robot/")
+    rules = [f"--remap={name}:=/robot/{name}" for name in ("pose", "action", "map")]
+    end = bnirl("infer", bag, "--out", tmp_path, *QUICK, *rules)
+    assert (end.status, end.err) == (0, "")
+    assert cells_in(tmp_path) == set(CORNERS)
+    assert bnirl("infer", bag, "--remap", "poses:=/robot/pose").status == 2
+    assert bnirl("infer", bag, "--remap", "pose=/robot/pose").status == 2
+
+
+def test_a_given_map_wins_over_the_recorded_one(
+    bnirl: Command, walk_bag: Path, tmp_path: Path
+) -> None:
+    rows = GRID.splitlines()
+    rows[-1] = "..#...."  # a cell on the way
+    given = tmp_path / "map.txt"
+    given.write_text("\n".join(rows) + "\n")
+    end = bnirl("infer", walk_bag, "--map", given, "--out", tmp_path, *QUICK)
+    assert end.status == 0
+    assert end.err == f"bnirl: {walk_bag}: left out 1 x pose in a blocked cell\n"
+    assert len(arrays_in(tmp_path)["observations"]) == OBSERVATIONS_OF_WALK - 1
+
+
+# Bad input
+
+
+def assert_refused(end: Ended, *words: str) -> None:
+    """Status 1, nothing on standard output, and one line that says all of the words."""
+    assert end.status == 1, end
+    assert end.out == ""
+    assert len(end.lines) == 1, end.err
+    assert end.err.startswith("bnirl: ")
+    for word in words:
+        assert word in end.err
+
+
+def test_what_is_no_bag_is_refused(bnirl: Command, tmp_path: Path) -> None:
+    assert_refused(bnirl("infer", tmp_path / "none"), f"{tmp_path / 'none'}: does not exist")
+    (tmp_path / "empty").mkdir()
+    assert_refused(bnirl("infer", tmp_path / "empty"), "holds no .mcap file")
+    (tmp_path / "text.mcap").write_text("no bag")
+    assert_refused(bnirl("infer", tmp_path / "text.mcap"), "is no MCAP file")
+
+
+def test_bad_input_ends_a_process_with_one_line_and_no_traceback(tmp_path: Path) -> None:
+    assert_refused(ended(in_process("infer", tmp_path / "none")), "does not exist")
+
+
+def test_a_bag_without_the_topics_says_which_it_has(bnirl: Command, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", walk(), prefix="/robot/")
+    assert_refused(
+        bnirl("infer", bag),
+        str(bag),
+        "has no topic /pose (geometry_msgs/msg/PoseStamped), only /robot/action (",
+        "/robot/pose (geometry_msgs/msg/PoseStamped)",
+        "--remap pose:=/topic",
+    )
+    assert_refused(bnirl("infer", bag, "--remap", "pose:=/robot/pose"), "has no topic /action")
+    swapped = ["--remap", "pose:=/robot/action", "--remap", "action:=/robot/pose"]
+    assert_refused(
+        bnirl("infer", bag, *swapped),
+        "topic /robot/action is of type geometry_msgs/msg/Vector3Stamped, not geometry_msgs/msg/P",
+    )
+
+
+def test_a_bag_without_a_map_asks_for_one(bnirl: Command, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", walk(), topics=("pose", "action"))
+    assert_refused(bnirl("infer", bag), str(bag), "no map", "--map")
+    (tmp_path / "map.txt").write_text(GRID)
+    arguments = ("--map", tmp_path / "map.txt", "--out", tmp_path, *QUICK)
+    assert bnirl("infer", bag, *arguments).status == 0
+
+
+@pytest.mark.parametrize("name", ["/pose", "/other"])
+def test_an_unknown_message_type_matters_only_where_it_is_wanted(
+    bnirl: Command, tmp_path: Path, name: str
+) -> None:
+    with mcap_of(write_bag(tmp_path / "walk", [map_of_grid(), *walk()])).open("rb") as source:
+        known = source.read()
+    path = tmp_path / "odd.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2", "test")
+        schema = writer.register_schema("odd_msgs/msg/Odd", "ros2msg", b"float64 oddity")
+        channel = writer.register_channel(name, "cdr", schema)
+        writer.add_message(channel, START, bytes(12), START)
+        writer.finish()
+    if name == "/pose":
+        assert_refused(bnirl("infer", path), "/pose is of type odd_msgs/msg/Odd")
+    else:
+        assert_refused(bnirl("infer", path), "only /other (odd_msgs/msg/Odd)")
+        (tmp_path / "both").mkdir()
+        (tmp_path / "both" / "a.mcap").write_bytes(known)
+        path.rename(tmp_path / "both" / "b.mcap")
+        end = bnirl("infer", tmp_path / "both", "--out", tmp_path, *QUICK)
+        assert end.status == 0
+        assert cells_in(tmp_path) == set(CORNERS)
+
+
+def test_of_a_truncated_bag_what_can_be_read_is_used(
+    bnirl: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bag_writer, "CHUNK_SIZE", 2048)
+    whole = mcap_of(write_bag(tmp_path / "bag", [map_of_grid(), *walk(rounds=3)])).read_bytes()
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(whole[: len(whole) // 2])
+    end = bnirl("infer", path, "--out", tmp_path, *QUICK)
+    assert end.status == 1
+    assert end.lines[-1].startswith(f"bnirl: {path}: is damaged at byte ")
+    assert "the results are from what could be read" in end.lines[-1]
+    # Where the bag breaks off, one of the two topics may have gone further than the other.
+    assert all("left out 1 x " in line for line in end.lines[:-1])
+    assert (
+        OBSERVATIONS_OF_WALK < len(arrays_in(tmp_path)["observations"]) < 3 * OBSERVATIONS_OF_WALK
+    )
+    assert sorted(path.name for path in tmp_path.glob("[ps]*.*")) == FILES
+
+    path.write_bytes(whole[:100])
+    assert_refused(bnirl("infer", path), str(path), "is damaged at byte", "/pose")
+
+
+def test_messages_that_cannot_be_used_are_counted_and_the_rest_is_used(
+    bnirl: Command, tmp_path: Path
+) -> None:
+    bad = [message for group in bad_messages(START + 9000 * SECOND).values() for message in group]
+    maps = [("map", message, START) for message in bad_maps().values()]
+    bag = write_bag(tmp_path / "bag", [map_of_grid(), *maps, *walk(), *bad])
+    end = bnirl("infer", bag, "--out", tmp_path / "out", *QUICK)
+    assert end.status == 0
+    for fault, count in BAD_COUNTS.items():
+        assert f"bnirl: {bag}: left out {count} x {fault}" in end.lines
+    for words in bad_maps():
+        (line,) = (line for line in end.lines if words in line)
+        assert "left out 1 x" in line
+        assert "topic /map" in line
+    assert len(end.lines) == len(BAD_COUNTS) + len(bad_maps())
+
+    good = write_bag(tmp_path / "good", [map_of_grid(), *walk()])
+    assert bnirl("infer", good, "--out", tmp_path / "good_out", *QUICK).status == 0
+    assert contents(tmp_path / "out") == contents(tmp_path / "good_out")
+
+
+def test_a_demonstration_with_nothing_on_the_map_is_refused(
+    bnirl: Command, tmp_path: Path
+) -> None:
+    outside = [pose_at(99.5, 0.5, START), action_of(1, 0, START)]
+    bag = write_bag(tmp_path / "bag", [map_of_grid(), *outside])
+    end = bnirl("infer", bag)
+    assert end.status == 1
+    assert end.lines[0] == f"bnirl: {bag}: left out 1 x pose outside the map"
+    assert len(end.lines) == 2
+    assert f"{bag}: no pose and action of equal stamps lie on the map" in end.lines[1]
+
+
+def test_a_map_without_a_free_cell_is_refused(bnirl: Command, tmp_path: Path) -> None:
+    (tmp_path / "map.txt").write_text("###\n###\n")
+    assert_refused(
+        bnirl("infer", PAPER_BAG, "--map", tmp_path / "map.txt"), "map.txt: no cell of the map is"
+    )
+    blocked = bad_maps()["no cell of the map is free"]
+    bag = write_bag(tmp_path / "bag", [("map", blocked, START), *walk()])
+    assert_refused(
+        bnirl("infer", bag), "has no map that can be used", "no cell of the map is free"
+    )
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        ("0,1,0,up", "line 3: action is 'up'"),
+        ("0,99,0,E", "line 3: cell (99, 0) is outside the map"),
+        ("0,3,3,E", "line 3: cell (3, 3) is blocked"),
+        ("0,nan,0,E", "line 3: x is 'nan'"),
+        ("0,0", "line 3: y is ''"),
+    ],
+)
+def test_a_bad_row_of_a_csv_is_named(bnirl: Command, tmp_path: Path, row: str, words: str) -> None:
+    (tmp_path / "map.txt").write_text(GRID)
+    table = tmp_path / "demo.csv"
+    table.write_text(f"episode,x,y,action\n0,0,0,E\n{row}\n")
+    assert_refused(bnirl("infer", table, "--map", tmp_path / "map.txt"), f"{table}, {words}")
+
+
+def test_results_that_cannot_be_written_are_one_line(
+    bnirl: Command, walk_bag: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    for out in (tmp_path / "file", tmp_path / "file" / "below"):
+        assert_refused(
+            bnirl("infer", walk_bag, "--out", out, *QUICK), str(out), "cannot be written there"
+        )
+
+
+# Wrong arguments
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--alpha", "0"], "alpha must be above 0, not 0"),
+        (["--alpha", "-1"], "alpha must be above 0, not -1"),
+        (["--alpha", "nan"], "alpha must be a finite number, not nan"),
+        (["--alpha", "much"], "invalid float value: 'much'"),
+        (["--eta", "0"], "eta must be above 0, not 0"),
+        (["--eta", "inf"], "eta must be a finite number, not inf"),
+        (["--sweeps", "5", "--burn-in", "5"], "sweeps must leave a draw: 5 sweeps less 5"),
+        (["--sweeps", "5", "--burn-in", "6"], "sweeps must leave a draw: 5 sweeps less 6"),
+        (["--thin", "0"], "thin must be at least 1, not 0"),
+        (["--chains", "0"], "chains must be at least 1"),
+        (["--seed", "-1"], "seed must be at least 0, not -1"),
+        (["--success", "0"], "success must be above 0 and at most 1, not 0"),
+        (["--discount", "1"], "discount must be at least 0 and below 1, not 1"),
+        (["--moves", "5"], "invalid choice: 5 (choose from"),
+        (["--model", "none"], "invalid choice: 'none'"),
+        (["--candidates", "all"], "invalid choice: 'all'"),
+        (["--colour", "red"], "unrecognized arguments: --colour"),
+    ],
+)
+def test_wrong_arguments_end_with_status_2(
+    bnirl: Command, arguments: list[str], words: str
+) -> None:
+    end = bnirl("infer", PAPER_BAG, *arguments)
+    assert end.status == 2
+    assert end.out == ""
+    assert words in end.lines[-1]
+    assert end.err.startswith("usage: bnirl")
+
+
+def test_a_csv_needs_a_map(bnirl: Command, tmp_path: Path) -> None:
+    (tmp_path / "demo.csv").write_text("episode,x,y,action\n0,0,0,E\n")
+    end = bnirl("infer", tmp_path / "demo.csv")
+    assert end.status == 2
+    assert "demo.csv: a CSV file tells no map; give one with --map" in end.lines[-1]
+
+
+def test_without_arguments_the_usage_is_shown(bnirl: Command) -> None:
+    for arguments in ([], ["infer"]):
+        end = bnirl(*arguments)
+        assert end.status == 2
+        assert end.err.startswith("usage: bnirl")
+
+
+def test_help_tells_every_setting_with_its_default(
+    bnirl: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "300")
+    end = bnirl("infer", "--help")
+    assert end.status == 0
+    told = end.out.split("options:")[1].split("\n  -")
+    for setting in fields(Settings):
+        option = "-" + setting.name.replace("_", "-")
+        (words,) = (each for each in told if each.startswith(f"{option} "))
+        assert words.rstrip().endswith(f"({setting.default})")
+    for option in ("--map", "--out", "--remap"):
+        assert option in end.out
+    assert "(bnirl_out)" in end.out
+    assert bnirl("--version").out == f"bnirl {bnirl_ros.__version__}\n"
+
+
+# Stopping it
+
+
+@pytest.mark.parametrize("moment", ["while it reads", "while it samples"])
+def test_ctrl_c_ends_with_status_130_and_one_line(tmp_path: Path, moment: str) -> None:
+    # A pipe in place of the file: when both ends are open, the command is there and reads.
+    table = tmp_path / "demo.csv"
+    os.mkfifo(table)
+    (tmp_path / "map.txt").write_text(GRID)
+    endless = ("--sweeps", "100000000", "--burn-in", "99000000", "--thin", "1000")
+    out = tmp_path / "out"
+    # A shell's `&` would have told us, and by us the command, to ignore it.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    process = in_process("infer", table, "--map", tmp_path / "map.txt", "--out", out, *endless)
+    with table.open("w") as file:
+        file.write("episode,x,y,action\n0,0,0,E\n0,1,0,NE\n")
+        file.flush()
+        if moment == "while it reads":
+            process.send_signal(signal.SIGINT)
+            end = ended(process)
+    if moment == "while it samples":
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(timeout=2)
+        process.send_signal(signal.SIGINT)
+        end = ended(process)
+    assert (end.status, end.out, end.err) == (130, "", "bnirl: stopped\n")
+    assert not out.exists()
+
+
+def test_the_tests_grid_is_what_its_text_says() -> None:
+    np.testing.assert_array_equal(parse_text_grid(GRID, "grid").free, MAP.free)
+    assert not MAP.free[3, 3]
