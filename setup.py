@@ -12,6 +12,7 @@ SHARED_FOLDERS = ("launch", "config", "bags", "msg_schemas")
 # The lower bounds of what has a rosdep key are the versions of Ubuntu 24.04, on which ROS 2 Jazzy
 # runs: a colcon build there takes those.
 REQUIREMENTS = [
+    "lz4>=4.0",
     "matplotlib>=3.6",
     "mcap>=1.2.1",
     "numba>=0.58",
@@ -21,6 +22,7 @@ REQUIREMENTS = [
     "rich>=13.7",
     "rosbags>=0.10.8",  # Codes messages as CDR and knows their type hashes, without ROS.
     "scipy>=1.11",
+    "zstandard>=0.22",
 ]
 
 EXTRAS = {
@@ -32,6 +34,7 @@ EXTRAS = {
         "ros-jazzy-rmw-fastrtps-cpp>=8.4",
     ],
     "test": [
+        "arviz-stats>=0.5",  # R-hat and effective sample size to compare ours with.
         "hypothesis>=6.98",
         "mcap-ros2-support>=0.5",  # A second decoder, to check the bags that we write.
         "pytest>=7.4",

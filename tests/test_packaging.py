@@ -6,6 +6,7 @@ import ast
 import importlib
 import re
 import runpy
+import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +21,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 # The rosdep key of each requirement of setup.py; None for one that rosdep does not know.
 ROSDEP_KEYS = {
+    "lz4": None,
     "matplotlib": "python3-matplotlib",
     "mcap": None,
     "numba": "python3-numba",
@@ -29,7 +31,11 @@ ROSDEP_KEYS = {
     "rich": "python3-rich",
     "rosbags": "python3-rosbags-pip",
     "scipy": "python3-scipy",
+    "zstandard": None,
 }
+
+# Requirements that are imported under another name.
+REQUIREMENT_OF_MODULE = {"PIL": "pillow", "yaml": "pyyaml"}
 
 # Packages of a ROS installation that are no messages, by the name under which they are imported.
 ROS_MODULES = {"ament_index_python", "launch", "launch_ros", "rclpy"}
@@ -61,8 +67,8 @@ def names(requirements: list[str]) -> set[str]:
     return {re.split(r"[^A-Za-z0-9._-]", requirement)[0].lower() for requirement in requirements}
 
 
-def imported_ros_packages(folder: Path) -> Iterator[str]:
-    """The ROS packages that the modules in `folder` import."""
+def imported_packages(folder: Path) -> Iterator[str]:
+    """The packages that the modules in `folder` import, anywhere in them."""
     for path in folder.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
@@ -71,9 +77,12 @@ def imported_ros_packages(folder: Path) -> Iterator[str]:
                 modules = [node.module or ""]
             else:
                 continue
-            for package in (module.partition(".")[0] for module in modules):
-                if package in ROS_MODULES or package.endswith(("_msgs", "_srvs", "_interfaces")):
-                    yield package
+            yield from (module.partition(".")[0] for module in modules)
+
+
+def is_ros(package: str) -> bool:
+    """Whether a package belongs to a ROS installation."""
+    return package in ROS_MODULES or package.endswith(("_msgs", "_srvs", "_interfaces"))
 
 
 def test_package_xml_is_an_ament_python_package(package_xml: ElementTree.Element) -> None:
@@ -105,11 +114,17 @@ def test_readme_names_the_requirements_that_rosdep_does_not_know(
 def test_package_xml_declares_the_ros_packages_that_are_imported(
     package_xml: ElementTree.Element,
 ) -> None:
+    imported = {*imported_packages(ROOT / "bnirl_ros"), *imported_packages(ROOT / "launch")}
+    assert set(filter(is_ros, imported)) <= texts(package_xml, "exec_depend")
+
+
+def test_setup_py_requires_what_is_imported(setup_arguments: dict[str, Any]) -> None:
     imported = {
-        *imported_ros_packages(ROOT / "bnirl_ros"),
-        *imported_ros_packages(ROOT / "launch"),
+        REQUIREMENT_OF_MODULE.get(package, package)
+        for package in imported_packages(ROOT / "bnirl_ros")
+        if package not in {*sys.stdlib_module_names, "bnirl_ros"} and not is_ros(package)
     }
-    assert imported <= texts(package_xml, "exec_depend")
+    assert imported == names(setup_arguments["install_requires"])
 
 
 def test_there_is_one_version(
