@@ -17,7 +17,7 @@ from launch_ros.substitutions import FindPackageShare
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Describe the two nodes; replay_node is left out while `bag` is empty."""
+    """Describe the two nodes; without a bag there is no replay_node."""
     params_file = PathJoinSubstitution(
         [FindPackageShare("bnirl_ros"), "config", "subgoal_node.yaml"]
     )
@@ -25,13 +25,17 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             DeclareLaunchArgument(
-                "params_file", default_value=params_file, description="Of subgoal_node."
+                "params_file",
+                default_value=params_file,
+                description="Parameters of subgoal_node.",
             ),
             DeclareLaunchArgument(
-                "bag", default_value="", description="Bag to replay; empty for none."
+                "bag",
+                default_value="",
+                description="Bag to replay, a folder or an .mcap file; empty: none.",
             ),
             DeclareLaunchArgument(
-                "rate", default_value="1.0", description="Replay so many times as fast."
+                "rate", default_value="1.0", description="Factor on the recorded pace, above 0."
             ),
             Node(
                 package="bnirl_ros",
