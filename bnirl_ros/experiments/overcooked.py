@@ -56,6 +56,7 @@ licence file to copy; its repository is under the MIT License. The copyright lin
 repository's owner and the year of its paper."""
 
 COLUMNS = ("episode", "t", "x", "y", "action")
+EFFECT_COLUMN = "interact_ok"
 
 FLOOR = " "
 """Where players walk in a layout; its other characters are furniture."""
@@ -86,6 +87,29 @@ def read_overcooked(folder: Path, layout: str) -> tuple[Demonstration, GridMap]:
     path = folder / f"{layout}.csv"
     rows = _read_rows(path, grid_map)
     return _demonstration(rows, path), grid_map
+
+
+def read_interactions(folder: Path, layout: str) -> npt.NDArray[np.int64]:
+    """Cells (M, 2) from which interactions that had an effect were made, in the file's order.
+
+    A further column, `interact_ok`, marks them by 1; no bag needs it.
+
+    Raises:
+        InputError: as in `read_overcooked`, or there is no such column.
+    """
+    grid_map = _read_layout(folder / f"{layout}.grid.txt")
+    path = folder / f"{layout}.csv"
+    reader = csv.DictReader(_read_text(path).splitlines())
+    if EFFECT_COLUMN not in (reader.fieldnames or ()):
+        raise InputError(
+            f"{path}, line 1: no column {EFFECT_COLUMN}; it tells which interactions had an effect"
+        )
+    cells = [
+        _observation(row, f"{path}, line {reader.line_num}", grid_map)[2:4]
+        for row in reader
+        if row[EFFECT_COLUMN] == "1"
+    ]
+    return np.array(cells, dtype=np.int64).reshape(-1, 2)
 
 
 def _read_text(path: Path) -> str:
