@@ -34,7 +34,7 @@ class RecordedDemonstration:
     damage: str | None
 
 
-def read_demonstration(path: Path, remappings: Mapping[str, str]) -> RecordedDemonstration:
+def read_demonstration(path: str | Path, remappings: Mapping[str, str]) -> RecordedDemonstration:
     """Read a demonstration from a rosbag2 folder or an MCAP file.
 
     Args:

@@ -1,0 +1,255 @@
+"""README.md and docs/architecture.md say what is there: commands, topics, parameters, files."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from bnirl_ros.bags.definitions import full_type_name
+from bnirl_ros.bags.demonstration import read_demonstration
+from bnirl_ros.cli import _parser
+from bnirl_ros.demonstrations.demonstration import Demonstration
+from bnirl_ros.demonstrations.messages import TOPIC_TYPES
+from bnirl_ros.demonstrations.placement import place
+from bnirl_ros.experiments.scenarios import PAPER_LOOP
+from bnirl_ros.inference.posterior import infer
+from bnirl_ros.inference.settings import Settings
+from bnirl_ros.inference.summary import summarise
+from bnirl_ros.maps import GridMap
+from bnirl_ros.views.tables import subgoal_table
+
+ROOT = Path(__file__).resolve().parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+PAGES = {
+    page: (ROOT / page).read_text(encoding="utf-8")
+    for page in ("README.md", "docs/architecture.md", "bags/README.md", "msg_schemas/README.md")
+}
+
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+SPAN = re.compile(r"`([^`]+)`")
+LINK = re.compile(r"\]\(([^)]+)\)")
+
+
+def fenced(page: str, language: str) -> list[str]:
+    """The blocks of code in a language."""
+    return [text for kind, text in FENCE.findall(page) if kind == language]
+
+
+def spans(page: str) -> list[str]:
+    """What stands in backticks outside blocks of code."""
+    return SPAN.findall(FENCE.sub("", page))
+
+
+def commands(page: str) -> list[list[str]]:
+    """The words of each command in shell blocks and backticks."""
+    lines = [line for block in fenced(page, "sh") for line in block.splitlines()]
+    return [shlex.split(text, comments=True) for text in [*lines, *spans(page)] if "'" not in text]
+
+
+def arguments_of(*beginning: str) -> list[list[str]]:
+    """What follows this beginning in the README's commands that go on."""
+    words = [command for command in commands(README) if command[: len(beginning)] == [*beginning]]
+    return [command[len(beginning) :] for command in words if len(command) > len(beginning)]
+
+
+def table(heading: str) -> dict[str, str]:
+    """First and second column of the README's table whose first heading is this."""
+    lines = README[README.index(f"| {heading} |") :].split("\n\n")[0].splitlines()[2:]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    return {row[0].strip("`"): row[1] for row in rows}
+
+
+def test_python_example_runs_and_finds_the_true_subgoals() -> None:
+    (example,) = fenced(README, "python")
+    assert len([line for line in example.splitlines() if line]) <= 10
+    done = subprocess.run(
+        [sys.executable, "-c", example], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    found = re.findall(r"^\d+ \((\d+), (\d+)\) ", done.stdout, re.MULTILINE)
+    assert {(int(x), int(y)) for x, y in found} == set(PAPER_LOOP.subgoals)
+
+
+@pytest.mark.parametrize("arguments", arguments_of("bnirl"), ids=shlex.join)
+def test_commands_parse(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    # A command's bare name, in prose, gets something to work on, and all of them show their help.
+    if arguments in (["infer"], ["replay"]):
+        arguments = [*arguments, "bags/paper_loop"]
+    if "--help" in arguments:
+        with pytest.raises(SystemExit, match=r"^0$"):
+            _parser().parse_args(arguments)
+        assert "usage" in capsys.readouterr().out
+        return
+    assert callable(_parser().parse_args(arguments).run)
+
+
+def test_there_are_commands_to_parse() -> None:
+    assert ["infer", "bags/overcooked_random3", "--alpha", "5"] in arguments_of("bnirl")
+    assert ["infer", "bags/paper_loop", "--out", "result"] in arguments_of("bnirl")
+
+
+def test_replay_commands_parse() -> None:
+    pytest.importorskip("rclpy")
+    from bnirl_ros.nodes.replay_node import parse
+
+    replays = arguments_of("ros2", "run", "bnirl_ros", "replay_node")
+    assert replays
+    for arguments in replays:
+        parse(arguments)
+
+
+def test_launch_arguments_are_declared_and_are_the_replays() -> None:
+    text = (ROOT / "launch" / "subgoals.launch.py").read_text(encoding="utf-8")
+    declared = set(re.findall(r'DeclareLaunchArgument\(\s*"(\w+)"', text))
+    assert declared == {"bag", "rate", "params_file"}
+    used = {
+        word.partition(":=")[0]
+        for _, *words in arguments_of("ros2", "launch", "bnirl_ros")
+        for word in words
+    }
+    assert used <= declared
+    pytest.importorskip("rclpy")
+    from bnirl_ros.nodes.replay_node import parse
+
+    assert 'arguments=[bag, "--rate", LaunchConfiguration("rate")]' in text
+    assert parse(["a bag", "--rate", "10.0"]).rate == 10.0
+
+
+def test_make_targets_exist() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for target, *_ in arguments_of("make"):
+        assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
+
+
+def test_modules_to_run_exist() -> None:
+    for page in PAGES.values():
+        for module in re.findall(r"python -m (bnirl_ros[\w.]+)", page):
+            assert (ROOT / f"{module.replace('.', '/')}.py").is_file(), module
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_named_files_exist(page: str) -> None:
+    names = [name for name in LINK.findall(PAGES[page]) if "://" not in name]
+    top = {path.name for path in ROOT.iterdir()}
+    for word in (word for words in commands(PAGES[page]) for word in words):
+        # A path from the root; one that begins elsewhere is the reader's own, or an output.
+        name = word.rpartition(":=")[2]
+        if name.partition("/")[0] in top and re.fullmatch(r"[\w./-]+", name):
+            names.append(name)
+    assert names
+    base = ROOT / Path(page).parent
+    for name in names:
+        assert (ROOT / name).exists() or (base / name).exists(), name
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_named_modules_exist(page: str) -> None:
+    for name in spans(PAGES[page]):
+        if re.fullmatch(r"[\w/]+\.(py|md|yaml|toml|rst)", name) and name not in (
+            "__init__.py",
+            "metadata.yaml",
+        ):
+            assert (ROOT / name).is_file(), name
+
+
+def test_every_folder_of_the_package_is_shown() -> None:
+    rooms = {path.parent for path in (ROOT / "bnirl_ros").glob("*/__init__.py")}
+    for page in (README, ARCHITECTURE):
+        assert {str(room.relative_to(ROOT)) for room in rooms} <= set(spans(page))
+
+
+def test_names_in_the_architecture_exist() -> None:
+    code = "\n".join(
+        path.read_text(encoding="utf-8") for path in sorted((ROOT / "bnirl_ros").rglob("*.py"))
+    )
+    diagram = "\n".join(re.findall(r"^    .*$", ARCHITECTURE, re.MULTILINE))
+    drawn = re.findall(r"[A-Z]?[a-z]+(?:_[a-z]+|[A-Z][a-z]+)+", diagram)
+    for name in {*spans(ARCHITECTURE), *drawn}:
+        if re.fullmatch(r"\w+(\(\))?", name) and not (ROOT / name).exists():
+            assert re.search(rf"\b{name.removesuffix('()')}\b", code), name
+
+
+def test_input_topics_are_the_codes() -> None:
+    told = table("`subgoal_node` hears")
+    types = {name: full_type_name(kind.partition(",")[0]) for name, kind in told.items()}
+    assert types == TOPIC_TYPES
+    assert told["map"].endswith(", transient local")
+
+
+def test_output_topics_are_the_codes() -> None:
+    pytest.importorskip("rclpy")
+    from bnirl_ros.nodes.subgoal_node import OUTPUTS
+    from bnirl_ros.views.messages import DiagnosticArray
+
+    told = table("`subgoal_node` publishes")
+    types = {name: full_type_name(kind.partition(",")[0]) for name, kind in told.items()}
+    assert types == {**OUTPUTS, "/diagnostics": DiagnosticArray.TYPE}
+    assert {name for name, kind in told.items() if kind.endswith(", transient local")} == {
+        *OUTPUTS
+    }
+
+
+def test_services_are_the_codes() -> None:
+    node = (ROOT / "bnirl_ros" / "nodes" / "subgoal_node.py").read_text(encoding="utf-8")
+    services = re.findall(r'create_service\((\w+), "(~/\w+)"', node)
+    assert table("service") == {name: f"std_srvs/{kind}" for kind, name in services}
+
+
+def test_parameter_file_has_every_parameter_with_its_default() -> None:
+    text = (ROOT / "config" / "subgoal_node.yaml").read_text(encoding="utf-8")
+    given = yaml.safe_load(text)["/**"]["ros__parameters"]
+    settings = {setting.name: setting.default for setting in fields(Settings)}
+    assert {name: given.get(name) for name in settings} == settings
+    # ROS takes no integer for a parameter of floating point.
+    assert {name: type(given[name]) for name in settings} == {
+        name: type(default) for name, default in settings.items()
+    }
+    pytest.importorskip("rclpy")
+    from bnirl_ros.nodes.subgoal_node import PARAMETERS
+
+    own = {parameter.name: parameter.default for parameter in PARAMETERS}
+    assert given == settings | own
+    assert all(type(given[name]) is type(default) for name, default in own.items())
+
+
+@pytest.fixture(scope="module")
+def kitchen() -> tuple[Demonstration, GridMap]:
+    """The demonstration of the demo, and its map."""
+    recorded = read_demonstration(ROOT / "bags" / "overcooked_random3", {})
+    assert recorded.grid_map is not None
+    return place(recorded.recording, recorded.grid_map).demonstration, recorded.grid_map
+
+
+def test_figures_of_the_demonstration(kitchen: tuple[Demonstration, GridMap]) -> None:
+    demonstration, grid_map = kitchen
+    stays = int(np.count_nonzero(demonstration.action == 0))
+    text = " ".join(README.split())
+    assert f"{len(np.unique(demonstration.episode))} episodes" in text
+    assert f"with {len(demonstration):,} observations" in text
+    assert f"{stays:,} of the {len(demonstration):,} actions are `stay`" in text
+    assert f"each of the {np.count_nonzero(grid_map.free)} free cells" in text
+
+
+def test_table_of_the_demo(kitchen: tuple[Demonstration, GridMap]) -> None:
+    demonstration, grid_map = kitchen
+    # Few sweeps: the mode and these probabilities are the same.
+    settings = Settings(alpha=5.0, sweeps=100, burn_in=50, chains=2)
+    summary = summarise(infer(demonstration, grid_map, settings), grid_map)
+    assert subgoal_table(summary.subgoals, summary.visit_sequence) in README
+
+
+def test_every_free_cell_is_a_subgoal_with_the_default_confidence(
+    kitchen: tuple[Demonstration, GridMap],
+) -> None:
+    demonstration, grid_map = kitchen
+    settings = Settings(sweeps=50, burn_in=25, chains=2)
+    summary = summarise(infer(demonstration, grid_map, settings), grid_map)
+    assert len(summary.subgoals) == np.count_nonzero(grid_map.free)
