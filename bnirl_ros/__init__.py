@@ -1,3 +1,59 @@
-"""Bayesian nonparametric inverse reinforcement learning for ROS 2 (Michini & How 2012)."""
+"""Bayesian nonparametric inverse reinforcement learning for ROS 2 (Michini & How 2012).
+
+The names in `__all__` are the way in from Python. Each is imported when it is first asked for, so
+that `import bnirl_ros` itself takes no time.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from bnirl_ros.bags.demonstration import read_demonstration
+    from bnirl_ros.demonstrations.csv_file import read_csv
+    from bnirl_ros.demonstrations.demonstration import Demonstration
+    from bnirl_ros.demonstrations.placement import place
+    from bnirl_ros.errors import InputError
+    from bnirl_ros.inference.posterior import infer
+    from bnirl_ros.inference.settings import Settings
+    from bnirl_ros.inference.summary import summarise
+    from bnirl_ros.maps import GridMap, load_map
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "Demonstration",
+    "GridMap",
+    "InputError",
+    "Settings",
+    "infer",
+    "load_map",
+    "place",
+    "read_csv",
+    "read_demonstration",
+    "summarise",
+]
+
+_MODULE_OF = {
+    "Demonstration": "demonstrations.demonstration",
+    "GridMap": "maps",
+    "InputError": "errors",
+    "Settings": "inference.settings",
+    "infer": "inference.posterior",
+    "load_map": "maps",
+    "place": "demonstrations.placement",
+    "read_csv": "demonstrations.csv_file",
+    "read_demonstration": "bags.demonstration",
+    "summarise": "inference.summary",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 from bnirl_ros.bags.cdr import decode
 from bnirl_ros.bags.reader import Bag
@@ -34,7 +35,9 @@ class RecordedDemonstration:
     damage: str | None
 
 
-def read_demonstration(path: str | Path, remappings: Mapping[str, str]) -> RecordedDemonstration:
+def read_demonstration(
+    path: str | Path, remappings: Mapping[str, str] = MappingProxyType({})
+) -> RecordedDemonstration:
     """Read a demonstration from a rosbag2 folder or an MCAP file.
 
     Args:
