@@ -41,6 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
     finally:
         gc.freeze()
+        gc.enable()
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -49,6 +50,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"bnirl {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    from bnirl_ros.demonstrations.placement import EPISODE_GAP
 
     infer = commands.add_parser("infer", help="infer the subgoals of a recorded demonstration")
     infer.add_argument(
@@ -68,6 +71,13 @@ def _parser() -> argparse.ArgumentParser:
         help="read the topic a (pose, action or map) from the recorded topic b",
     )
     _add_settings(infer)
+    infer.add_argument(
+        "--episode-gap",
+        type=_above_zero,
+        default=EPISODE_GAP,
+        metavar="SECONDS",
+        help="longest time between two poses of one episode (%(default)s)",
+    )
     infer.set_defaults(run=_infer, command=infer)
 
     commands.add_parser("replay", help="play a recorded demonstration onto its topics")
@@ -75,10 +85,23 @@ def _parser() -> argparse.ArgumentParser:
     demo = commands.add_parser("demo", help="watch a human demonstration become subgoals")
     demo.add_argument("--bag", type=Path, help="another bag than the human demonstration")
     demo.add_argument(
+        "--alpha",
+        type=_above_zero,
+        default=5.0,
+        help="confidence; lower than that of infer, since people dither (%(default)s)",
+    )
+    demo.add_argument(
         "--out", type=Path, default=Path("bnirl_out"), help="folder for the results (%(default)s)"
     )
     demo.set_defaults(run=_demo)
     return parser
+
+
+def _above_zero(text: str) -> float:
+    value = float(text)
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"must be above 0, not {text}")
+    return value
 
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
@@ -153,7 +176,8 @@ def _replay(arguments: Sequence[str]) -> int:
     _needs_ros()
     from bnirl_ros.nodes.replay_node import main as replay
 
-    return replay(arguments)
+    gc.enable()  # this may run for long
+    return replay(arguments, "bnirl replay")
 
 
 def _demo(options: argparse.Namespace) -> int:
@@ -161,7 +185,8 @@ def _demo(options: argparse.Namespace) -> int:
     _needs_ros()
     from bnirl_ros.nodes.demo import main as demo
 
-    return demo(options.bag, options.out)
+    gc.enable()  # this may run for long
+    return demo(options.bag, options.out, options.alpha)
 
 
 def _needs_ros() -> None:
@@ -197,7 +222,7 @@ def _read(
     if grid_map is None:
         reasons = "".join(f" ({fault})" for fault in recorded.faults if "map" in fault)
         raise InputError(f"{path}: has no map that can be used{reasons}; give one with --map")
-    placement = place(recorded.recording, grid_map, settings.moves)
+    placement = place(recorded.recording, grid_map, settings.moves, options.episode_gap)
     for fault, count in (recorded.faults + placement.faults).items():
         _warn(f"{path}: left out {count} x {fault}")
     if len(placement.demonstration) == 0:

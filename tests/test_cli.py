@@ -166,6 +166,7 @@ def test_subgoals_json_is_the_contract(default_run: tuple[Ended, Path]) -> None:
         "resolution",
         "model",
         "subgoals",
+        "visit_sequence",
         "diagnostics",
     ]
     assert (document["format"], document["frame_id"], document["resolution"]) == (1, "map", 1.0)

@@ -10,13 +10,15 @@ import pytest
 
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.errors import InputError
-from bnirl_ros.inference.chains import StoppedError
+from bnirl_ros.inference.chains import StoppedError, run_chains
 from bnirl_ros.inference.mode import ascend
-from bnirl_ros.inference.posterior import Posterior, infer, paper_model
+from bnirl_ros.inference.posterior import Posterior, grid_world, infer, paper_model
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.inference.summary import episode_visits, summarise
 from bnirl_ros.maps.grid_map import GridMap
 from bnirl_ros.mdp.actions import STEPS
+from bnirl_ros.mdp.finite_mdp import FiniteMDP
+from bnirl_ros.model.mixture import subgoal_mixture
 from reference import set_partitions
 
 MAP = GridMap(np.ones((7, 7), dtype=bool), resolution=0.5, origin=(-1.0, 2.0, 0.0))
@@ -157,6 +159,18 @@ def test_ascent_never_loses_and_tells_its_log_joint(posterior: Posterior) -> Non
         )
 
 
+def test_the_sampler_takes_any_finite_mdp() -> None:
+    world = grid_world(MAP, QUICK)
+    mdp = FiniteMDP.from_transitions(world.transitions(), world.discount)
+    candidates, on_grid = paper_model(ROUND, MAP, QUICK)
+    states, goals = world.states_of(ROUND.cells), world.states_of(candidates)
+    mixture = subgoal_mixture(mdp, states, ROUND.action, goals, QUICK.alpha, QUICK.eta)
+    np.testing.assert_allclose(mixture.log_likelihood, on_grid.log_likelihood, atol=1e-5)
+    np.testing.assert_array_equal(mixture.pair_of, on_grid.pair_of)
+    draws = run_chains(mixture, QUICK)
+    np.testing.assert_array_equal(draws.subgoal_of, run_chains(on_grid, QUICK).subgoal_of)
+
+
 def test_progress_counts_every_sweep_and_stopping_stops() -> None:
     done: list[int] = []
     infer(ROUND, MAP, QUICK, progress=done.append)
@@ -188,6 +202,9 @@ def test_nothing_observed_is_nothing_to_infer() -> None:
         ({"thin": 0}, "thin must be at least 1"),
         ({"model": "best"}, "model must be one of paper"),
         ({"seed": -1}, "seed must be at least 0"),
+        ({"alpha": "5"}, "alpha must be of type float, not '5'"),
+        ({"sweeps": 1000.5}, "sweeps must be of type int, not 1000.5"),
+        ({"chains": True}, "chains must be of type int, not True"),
     ],
 )
 def test_settings_out_of_range_are_refused_by_name(wrong: dict[str, object], words: str) -> None:

@@ -81,8 +81,10 @@ def test_python_example_runs_and_finds_the_true_subgoals() -> None:
 @pytest.mark.parametrize("arguments", arguments_of("bnirl"), ids=shlex.join)
 def test_commands_parse(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     # A command's bare name, in prose, gets something to work on, and all of them show their help.
-    if arguments in (["infer"], ["replay"]):
+    if arguments == ["infer"]:
         arguments = [*arguments, "bags/paper_loop"]
+    if arguments == ["replay"]:  # its options are replay_node's: see below
+        return
     if "--help" in arguments:
         with pytest.raises(SystemExit, match=r"^0$"):
             _parser().parse_args(arguments)

@@ -47,16 +47,17 @@ class Result:
 class BackgroundInference:
     """Keeps a posterior up to date with a recorder, in a thread of its own.
 
-    All methods return at once. Whatever goes wrong in the thread is kept as `error` and the next
-    change tried again: it never ends before `close`.
+    All methods return at once. Whatever goes wrong in the thread is remembered and the next change
+    tried again: it never ends before `close`.
 
     Attributes:
-        error: the last thing that went wrong, in one sentence; empty if nothing did.
+        error: what went wrong at the last try, in one sentence; empty if nothing did.
+        last_error: what went wrong last, at whatever try.
     """
 
     def __init__(self, recorder: Recorder, settings: Settings, episode_gap: float) -> None:
         """Start the thread; it waits for a map and observations."""
-        self.error = ""
+        self.error = self.last_error = ""
         self._recorder = recorder
         self._settings = settings
         self._episode_gap = episode_gap
@@ -70,6 +71,7 @@ class BackgroundInference:
         self._running: RunningPosterior | None = None
         self._stands = False  # the last result was asked for, and nothing has changed since
         self._forget = False
+        self._resets = 0
         self._stop = Event()
         self._wake = Condition()
         self._thread = Thread(target=self._run, name="inference", daemon=True)
@@ -104,8 +106,8 @@ class BackgroundInference:
             return not self._at_work and not self._has_work()
 
     def reset(self) -> None:
-        """Forget the chains; the recorder was cleared."""
-        self._update(_forget=True, _changed=True)
+        """Forget the chains and any result not yet taken; the recorder was cleared."""
+        self._update(_forget=True, _changed=True, _result=None, _resets=self._resets + 1)
 
     def infer(self, finish: Callable[[Result], None] | None = None) -> Future[Result]:
         """Ask for an inference with fresh chains over all observations so far.
@@ -151,6 +153,7 @@ class BackgroundInference:
                 self._at_work = False
                 self._wake.wait_for(self._has_work)
                 self._at_work = True
+                resets = self._resets
                 if self._closed:
                     for waiting, _ in self._requests:
                         waiting.cancel()
@@ -158,19 +161,21 @@ class BackgroundInference:
                 request, finish = self._requests.pop(0) if self._requests else (None, None)
             try:
                 if request:
-                    self._answer(request, finish)
+                    self._answer(request, finish, resets)
                 else:
-                    self._publish(self._next_running_result())
+                    self._publish(self._next_running_result(), resets)
                 self.error = ""
             except Exception as error:  # a thread that died would go unnoticed
-                self.error = f"{type(error).__name__}: {error}"
+                self.error = self.last_error = f"{type(error).__name__}: {error}"
                 self._running = None
                 if request and not request.done():
                     request.set_exception(error)
 
-    def _publish(self, result: Result) -> None:
+    def _publish(self, result: Result, resets: int) -> None:
+        """Offer a result, unless what it is about was forgotten meanwhile."""
         with self._wake:
-            self._result = result
+            if resets == self._resets:
+                self._result = result
 
     def _place(self) -> tuple[Placement, GridMap, Settings]:
         """What was recorded, on the present map."""
@@ -184,23 +189,35 @@ class BackgroundInference:
         recording = self._recorder.snapshot()
         return place(recording, grid_map, settings.moves, self._episode_gap), grid_map, settings
 
-    def _answer(self, request: Future[Result], finish: Callable[[Result], None] | None) -> None:
+    def _answer(
+        self,
+        request: Future[Result],
+        finish: Callable[[Result], None] | None,
+        resets: int,
+    ) -> None:
         """Infer with fresh chains."""
         try:
             placement, grid_map, settings = self._place()
             posterior = infer(placement.demonstration, grid_map, settings, stop=self._stop)
-            summary = summarise(posterior, grid_map)
-            result = Result(grid_map, placement, summary, settings.sweeps, posterior, settings)
+        except InputError as error:
+            self._changed = True  # what is new was taken note of, but not taken in
+            self.last_error = str(error)
+            request.set_exception(error)
+            return
+        except StoppedError:
+            request.cancel()
+            return
+        summary = summarise(posterior, grid_map)
+        result = Result(grid_map, placement, summary, settings.sweeps, posterior, settings)
+        self._stands = True
+        self._publish(replace(result, posterior=None), resets)
+        try:
             if finish:
                 finish(result)
         except InputError as error:
-            self._changed = True  # what is new was taken note of, but not taken in
+            self.last_error = str(error)
             request.set_exception(error)
-        except StoppedError:
-            request.cancel()
         else:
-            self._stands = True
-            self._publish(replace(result, posterior=None))
             request.set_result(result)
 
     def _next_running_result(self) -> Result:

@@ -122,6 +122,14 @@ def seat(
     return state
 
 
+def assignments(
+    state: PartitionState,
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Partition, in any numbers, and subgoal of each observation (N,), as `seat` takes them."""
+    partition_of = state.partition_of.astype(np.int64)
+    return partition_of, state.subgoal_of_slot[partition_of].astype(np.int64)
+
+
 def advance(
     mixture: SubgoalMixture,
     state: PartitionState,

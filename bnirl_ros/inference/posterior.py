@@ -71,7 +71,12 @@ def paper_model(
     world = grid_world(grid_map, settings)
     candidates = candidate_cells(settings.candidates, demonstration, world)
     return candidates, subgoal_mixture(
-        demonstration, world, candidates, settings.alpha, settings.eta
+        world,
+        world.states_of(demonstration.cells),
+        demonstration.action,
+        world.states_of(candidates),
+        settings.alpha,
+        settings.eta,
     )
 
 

@@ -104,12 +104,12 @@ class RunningPosterior:
         candidate_of_old = self._candidates_on(before)
         states = []
         for state, generator in zip(before._states, self._generators, strict=True):
-            partitions = state.partition_of[old]
-            subgoals = candidate_of_old[state.subgoal_of_slot[partitions]]
+            partitions, subgoals = sampler.assignments(state)
+            subgoals_now = candidate_of_old[subgoals[old]]
             partition_of = np.full(len(self.placement.poses), -1, dtype=np.int64)
             subgoal_of = partition_of.copy()
-            partition_of[new] = np.where(subgoals >= 0, partitions, -1)
-            subgoal_of[new] = subgoals
+            partition_of[new] = np.where(subgoals_now >= 0, partitions[old], -1)
+            subgoal_of[new] = subgoals_now
             states.append(sampler.seat(self._mixture, partition_of, subgoal_of, generator))
         return states
 

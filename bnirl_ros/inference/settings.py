@@ -105,6 +105,11 @@ class Settings:
 
     def __post_init__(self) -> None:
         for setting in fields(self):
+            value, kind = getattr(self, setting.name), type(setting.default)
+            if kind is float and type(value) is int:
+                object.__setattr__(self, setting.name, float(value))
+            elif type(value) is not kind:
+                raise InputError(f"{setting.name} must be of type {kind.__name__}, not {value!r}")
             fault = limits_of(setting).fault(setting.name, getattr(self, setting.name))
             if fault:
                 raise InputError(fault)

@@ -8,9 +8,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from bnirl_ros.demonstrations.demonstration import Demonstration
-from bnirl_ros.mdp.goal_values import goal_values
-from bnirl_ros.mdp.grid_world import GridWorld
+from bnirl_ros.mdp.goal_values import MarkovDecisionProcess, goal_values
 from bnirl_ros.model.likelihood import action_log_likelihood
 
 
@@ -73,30 +71,32 @@ def log_crp(sizes: npt.ArrayLike, eta: float) -> float:
 
 
 def subgoal_mixture(
-    demonstration: Demonstration,
-    world: GridWorld,
-    candidates: npt.NDArray[np.int64],
+    mdp: MarkovDecisionProcess,
+    states: npt.ArrayLike,
+    actions: npt.ArrayLike,
+    candidates: npt.ArrayLike,
     alpha: float,
     eta: float,
 ) -> SubgoalMixture:
     """The paper's model of a demonstration: likelihood (7), P(g) uniform over the candidates.
 
     Args:
-        demonstration: N observations on free cells, their actions among those of `world`.
-        world: the grid world in which they were made.
-        candidates: (G, 2) free cells in the support of P(g).
+        mdp: the grid world or finite MDP in which the observations were made.
+        states: (N,) state number of each observation.
+        actions: (N,) its action, one of `mdp.actions`.
+        candidates: (G,) state numbers in the support of P(g).
         alpha: confidence; above 0.
         eta: concentration; above 0.
     """
-    states = world.states_of(demonstration.cells)
-    visited, state_index = np.unique(states, return_inverse=True)
-    position = np.searchsorted(world.actions, demonstration.action)
-    pairs, pair_of = np.unique(state_index * len(world.actions) + position, return_inverse=True)
-    values = goal_values(world, world.states_of(candidates), visited)
-    by_pair = action_log_likelihood(values, alpha).reshape(-1, len(candidates))
+    goals = np.asarray(candidates, dtype=np.int64)
+    visited, state_index = np.unique(np.asarray(states), return_inverse=True)
+    position = np.searchsorted(mdp.actions, np.asarray(actions))
+    pairs, pair_of = np.unique(state_index * len(mdp.actions) + position, return_inverse=True)
+    values = goal_values(mdp, goals, visited)
+    by_pair = action_log_likelihood(values, alpha).reshape(-1, len(goals))
     return SubgoalMixture(
         log_likelihood=np.ascontiguousarray(by_pair[pairs]),
         pair_of=pair_of.astype(np.int64),
-        log_prior=np.full(len(candidates), -np.log(len(candidates))),
+        log_prior=np.full(len(goals), -np.log(len(goals))),
         eta=eta,
     )

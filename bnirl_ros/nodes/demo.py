@@ -22,9 +22,8 @@ from bnirl_ros.bags.qos import LATCHED, QosProfile
 from bnirl_ros.bags.writer import BagWriter
 from bnirl_ros.demonstrations.messages import TOPIC_TYPES
 from bnirl_ros.errors import InputError
-from bnirl_ros.inference.settings import Settings
 from bnirl_ros.nodes.conversion import message_class
-from bnirl_ros.nodes.running import run
+from bnirl_ros.nodes.process import run
 from bnirl_ros.nodes.subgoal_node import OUTPUTS
 from bnirl_ros.resources import share_folder
 from bnirl_ros.views.messages import DiagnosticArray
@@ -37,10 +36,7 @@ _RECORDED = {
     "/diagnostics": DiagnosticArray.TYPE,
 }
 HUMAN_BAG = "overcooked_random3"
-"""The bag that is replayed unless another one is named: two people's play, 16 episodes."""
-
-HUMAN_ALPHA = 5.0
-"""Confidence for it: people dither and stand about, optimal demonstrators (the default) do not."""
+"""The bag that is replayed unless another one is named: 16 episodes of people at play."""
 
 _PATIENCE = 300.0  # [s] for anything that is waited for
 _END_PATIENCE = 20.0  # [s] for a node to end
@@ -125,11 +121,15 @@ def demo(bag: Path, out: Path, alpha: float) -> None:
             return True
 
         def settled() -> bool:
-            tell(watcher.news())
+            ended(node, "subgoal_node")
             known = watcher.diagnostics
             return known.get("queue") == "0" and known.get("state") == "settled"
 
-        watcher.spin_until("the replay", lambda: ended(replay, "replay_node"))
+        def replayed() -> bool:
+            ended(node, "subgoal_node")
+            return ended(replay, "replay_node")
+
+        watcher.spin_until("the replay", replayed)
         watcher.spin_until("the inference", settled)
         tell("asks for an inference with fresh chains")
         answer = watcher.infer.call_async(Trigger.Request())
@@ -189,10 +189,11 @@ def _teller() -> Iterator[Callable[[str], None]]:
     yield tell
 
 
-def main(bag: Path | None, out: Path) -> int:
+def main(bag: Path | None, out: Path, alpha: float) -> int:
     """Run the demo with the human bag or another one; returns the exit status."""
-    # Other machines' robots need not hear of it.
+    # Robots and other demos need not hear of it; who wants to listen names the same domain.
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    alpha = HUMAN_ALPHA if bag is None else Settings().alpha
+    domain = os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    print(f"To watch in RViz or Foxglove on this machine: ROS_DOMAIN_ID={domain}", flush=True)
     played = bag or share_folder() / "bags" / HUMAN_BAG
     return run("bnirl demo", lambda: demo(played, out, alpha), [])

@@ -6,7 +6,7 @@ import argparse
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from bnirl_ros.bags.reader import Bag, RawMessage, Topic
 from bnirl_ros.errors import InputError
 from bnirl_ros.maps import load_map
 from bnirl_ros.nodes.conversion import message_class, to_ros
-from bnirl_ros.nodes.running import run
+from bnirl_ros.nodes.process import run
 from bnirl_ros.views.belief import map_message
 
 _DEPTH = 1000  # of a reliable publisher at least that plays at a pace
@@ -66,6 +66,7 @@ class ReplayNode(Node):
         self.sent: Counter[str] = Counter()
         self.skipped: dict[str, str] = {}
         self._topic_publishers: dict[str, Any] = {}
+        self._latched: set[str] = set()
         for topic in bag.topics():
             self._announce(topic)
 
@@ -97,16 +98,25 @@ class ReplayNode(Node):
         self._topic_publishers["/map"].publish(to_ros(view))
         self.sent["/map"] += 1
 
-    def play(self, messages: Iterable[RawMessage]) -> None:
-        """Publish messages in their order.
+    def play(self, bag: Bag) -> None:
+        """Publish a bag's messages: the first one of each latched topic, then all in their order.
 
         With a rate, each is sent at its recorded time since the first one over the rate; without,
         as soon as the subscribers have acknowledged those before.
         """
+        first: dict[str, RawMessage] = {}
+        for message in bag.messages(self._latched):
+            if message.topic not in first:
+                first[message.topic] = message
+                self._topic_publishers[message.topic].publish(message.data)
+                self.sent[message.topic] += 1
+                if len(first) == len(self._latched):
+                    break
         start: tuple[float, int] | None = None
-        for message in messages:
-            publisher = self._topic_publishers.get(message.topic)
-            if publisher is None:
+        for message in bag.messages(self._topic_publishers):
+            publisher = self._topic_publishers[message.topic]
+            if first.get(message.topic) == message:  # sent already
+                del first[message.topic]
                 continue
             if start is None:
                 start = (time.monotonic(), message.log_time)
@@ -148,7 +158,9 @@ class ReplayNode(Node):
             self.skipped[topic.name] = f"type {topic.type_name or 'unknown'} isn't installed"
             return
         recorded = topic.qos[0] if topic.qos else QosProfile()
-        if recorded.durability != LATCHED.durability and recorded.reliability != "best_effort":
+        if recorded.durability == LATCHED.durability:
+            self._latched.add(topic.name)
+        elif recorded.reliability != "best_effort":
             depth = _ROUND if self._rate is None else max(recorded.depth, _DEPTH)
             recorded = replace(recorded, depth=depth)
         self._topic_publishers[topic.name] = self.create_publisher(
@@ -196,7 +208,7 @@ def replay(options: Options) -> None:
         for topic, why in node.skipped.items():
             log.warning(f"{topic} is not sent: {why}")
         node.wait_for_subscribers(options.patience)
-        node.play(bag.messages())
+        node.play(bag)
         if bag.damage:
             raise InputError(bag.damage)
     finally:
@@ -204,17 +216,11 @@ def replay(options: Options) -> None:
         node.destroy_node()
 
 
-def parse(arguments: Sequence[str]) -> Options:
+def parse(arguments: Sequence[str], name: str = "replay_node") -> Options:
     """The options on a command line without ROS arguments; wrong ones end with status 2."""
     parser = argparse.ArgumentParser(
-        prog="replay_node", description="Play a recorded demonstration onto its topics."
+        prog=name, description="Play a recorded demonstration onto its topics."
     )
-    add_arguments(parser)
-    return options_of(vars(parser.parse_args(arguments)))
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the replay's arguments to a parser."""
     parser.add_argument("bag", metavar="BAG", type=Path, help="rosbag2 folder or .mcap file")
     pace = parser.add_mutually_exclusive_group()
     pace.add_argument(
@@ -229,16 +235,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--wait",
         type=_positive,
-        default=30.0,
+        default=10.0,
         metavar="SECONDS",
         help="how long to wait for a subscriber of every topic (%(default)s)",
     )
 
-
-def options_of(values: Mapping[str, Any]) -> Options:
-    """The options that parsed arguments mean."""
-    rate = None if values["fast"] else values["rate"]
-    return Options(values["bag"], rate, values["map"], values["wait"])
+    given = parser.parse_args(arguments)
+    return Options(given.bag, None if given.fast else given.rate, given.map, given.wait)
 
 
 def _positive(text: str) -> float:
@@ -248,11 +251,11 @@ def _positive(text: str) -> float:
     return value
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None, name: str = "replay_node") -> int:
     """Run the node until the bag's end, or until it is stopped; returns the exit status."""
     given = sys.argv[1:] if arguments is None else list(arguments)
-    options = parse(remove_ros_args(["replay_node", *given])[1:])
-    return run("replay_node", lambda: replay(options), given)
+    options = parse(remove_ros_args([name, *given])[1:], name)
+    return run(name, lambda: replay(options), given)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from bnirl_ros.demonstrations.messages import TOPIC_TYPES, map_of, take_action, take_pose
-from bnirl_ros.demonstrations.placement import EPISODE_GAP
+from bnirl_ros.demonstrations.placement import EPISODE_GAP, place
 from bnirl_ros.demonstrations.recording import Recorder
 from bnirl_ros.errors import InputError
 from bnirl_ros.inference.background import BackgroundInference, Result
@@ -27,7 +27,7 @@ from bnirl_ros.inference.settings import Limits
 from bnirl_ros.inference.summary import nothing_found
 from bnirl_ros.nodes.conversion import message_class, to_ros
 from bnirl_ros.nodes.parameters import NodeParameter, declare, declare_settings
-from bnirl_ros.nodes.running import run, spin
+from bnirl_ros.nodes.process import run, spin
 from bnirl_ros.views.belief import belief_grid
 from bnirl_ros.views.diagnostics import Health, diagnostic_array
 from bnirl_ros.views.markers import assignment_markers, subgoal_markers
@@ -204,6 +204,9 @@ class SubgoalNode(Node):
         self._recorder.clear()
         self._faults.clear()
         self._inference.reset()
+        if self._result:
+            grid_map = self._result.grid_map
+            self._publish(Result(grid_map, place(self._recorder.snapshot(), grid_map), None, 0))
         response.success = True
         response.message = "all observations are forgotten"
         return response
@@ -222,7 +225,6 @@ class SubgoalNode(Node):
         self._answers = [(request, done) for request, done in self._answers if not done.done()]
         result = self._inference.take_result()
         if result is not None:
-            self._result = result
             self._publish(result)
         now = self.get_clock().now().nanoseconds
         since = now - self._assignments_at
@@ -232,6 +234,7 @@ class SubgoalNode(Node):
             self._assignments_due, self._assignments_at = False, now
 
     def _publish(self, result: Result) -> None:
+        self._result = result
         self._send("subgoals", self._view(subgoal_markers, result))
         self._send("waypoints", self._view(waypoint_path, result))
         self._send("subgoal_belief", self._view(belief_grid, result))
@@ -259,6 +262,7 @@ class SubgoalNode(Node):
             summary=result.summary if result else None,
             faults=faults,
             error=self._inference.error,
+            last_error=self._inference.last_error,
         )
         view = diagnostic_array(health, self.get_clock().now().nanoseconds)
         self._diagnostics.publish(to_ros(view))

@@ -22,7 +22,8 @@ class Health:
         sweeps: sweeps of each chain for the last result.
         summary: what it says; None without observations.
         faults: how often each fault occurred among the messages that are left out.
-        error: the last thing that went wrong in the inference; empty for nothing.
+        error: what is wrong with the inference now; empty for nothing.
+        last_error: what went wrong last, be it mended or not; empty for nothing.
     """
 
     name: str
@@ -34,6 +35,7 @@ class Health:
     summary: Summary | None
     faults: Mapping[str, int]
     error: str
+    last_error: str
 
 
 def diagnostic_array(health: Health, stamp_ns: int) -> DiagnosticArray:
@@ -59,7 +61,7 @@ def diagnostic_array(health: Health, stamp_ns: int) -> DiagnosticArray:
         "queue": str(health.waiting),
         "drops": str(drops),
         **{f"left out: {fault}": str(count) for fault, count in sorted(health.faults.items())},
-        "last error": health.error,
+        "last error": health.last_error,
     }
     status = DiagnosticStatus(
         level=level,
