@@ -196,4 +196,14 @@ def main(bag: Path | None, out: Path, alpha: float) -> int:
     domain = os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     print(f"To watch in RViz or Foxglove on this machine: ROS_DOMAIN_ID={domain}", flush=True)
     played = bag or share_folder() / "bags" / HUMAN_BAG
-    return run("bnirl demo", lambda: demo(played, out, alpha), [])
+    finished = False
+
+    def body() -> None:
+        nonlocal finished
+        demo(played, out, alpha)
+        finished = True
+
+    status = run("bnirl demo", body, [])
+    if status == 0 and not finished:
+        raise KeyboardInterrupt  # which ends a command, unlike a node, with status 130
+    return status
