@@ -101,10 +101,10 @@ def bad_messages(start: int) -> dict[str, list[TopicMessage]]:
             pose_at(0.5, float("inf"), at(0)),
         ],
         "pose in another frame than the map": [pose_at(0.5, 0.5, at(1), "odom")],
-        "pose outside the map": [pose_at(99.5, 0.5, at(2)), action_of(1, 0, at(2))],
-        "pose in a blocked cell": [pose_at(3.5, 3.5, at(3)), action_of(1, 0, at(3))],
-        "action that is no unit step": [action_of(0.5, 0, at(4)), action_of(2, 0, at(4))],
-        "action without a pose of its stamp": [action_of(1, 0, at(5))],
+        "pose outside the map": [pose_at(99.5, 0.5, at(2)), action_of(1.0, 0.0, at(2))],
+        "pose in a blocked cell": [pose_at(3.5, 3.5, at(3)), action_of(1.0, 0.0, at(3))],
+        "action that is no unit step": [action_of(0.5, 0.0, at(4)), action_of(2.0, 0.0, at(4))],
+        "action without a pose of its stamp": [action_of(1.0, 0.0, at(5))],
         "pose without an action of its stamp": [pose_at(0.5, 0.5, at(6))],
     }
 

@@ -502,7 +502,7 @@ def test_messages_that_cannot_be_used_are_counted_and_the_rest_is_used(
 def test_a_demonstration_with_nothing_on_the_map_is_refused(
     bnirl: Command, tmp_path: Path
 ) -> None:
-    outside = [pose_at(99.5, 0.5, START), action_of(1, 0, START)]
+    outside = [pose_at(99.5, 0.5, START), action_of(1.0, 0.0, START)]
     bag = write_bag(tmp_path / "bag", [map_of_grid(), *outside])
     end = bnirl("infer", bag)
     assert end.status == 1

@@ -16,7 +16,6 @@ from rcl_interfaces.msg import (
 from rclpy.exceptions import (
     InvalidParameterTypeException,
     InvalidParameterValueException,
-    ParameterImmutableException,
 )
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -99,8 +98,10 @@ def _declared(node: Node, entry: NodeParameter) -> Any:
             f"parameter {entry.name}: must be of type {type(entry.default).__name__}, such as "
             f"{entry.default!r}"
         ) from error
-    except (InvalidParameterValueException, ParameterImmutableException) as error:
-        raise InputError(f"parameter {entry.name}: {error}") from error
+    except InvalidParameterValueException as error:
+        raise InputError(
+            f"parameter {entry.name}: must be {entry.limits.range_in_words()}"
+        ) from error
     fault = entry.limits.fault(entry.name, value)
     if fault:
         raise InputError(f"parameter {fault}")

@@ -1,0 +1,146 @@
+"""What the tests of the nodes share: nodes as processes, and a node of the test's own."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import bnirl_ros
+
+rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
+_qos = importlib.import_module("rclpy.qos")
+_executors = importlib.import_module("rclpy.executors")
+
+PATIENCE = 90.0
+"""How long to wait for what should come at once [s]; kernels may have to be compiled first."""
+
+RELIABLE = _qos.QoSProfile(depth=40_000)
+LATCHED = _qos.QoSProfile(depth=1, durability=_qos.DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def isolate(log_folder: Path) -> None:
+    """Let this process and those it starts meet on this machine, and nobody else."""
+    os.environ |= {
+        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_LOG_DIR": str(log_folder),
+    }
+    # A shell's `&` lets its processes, and theirs, ignore it.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a process ended, and what it said."""
+
+    status: int
+    out: str
+    err: str
+
+
+class NodeProcess:
+    """One of our nodes, started as `ros2 run` starts it."""
+
+    def __init__(self, name: str, folder: Path, *arguments: str | Path) -> None:
+        """`folder`: for what it says."""
+        self._out, self._err = folder / "out.txt", folder / "err.txt"
+        code = f"import sys; from bnirl_ros.nodes.start import {name}; sys.exit({name}())"
+        with self._out.open("wb") as out, self._err.open("wb") as err:
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", code, *map(str, arguments)],
+                stdout=out,
+                stderr=err,
+                env=os.environ | {"PYTHONPATH": str(Path(bnirl_ros.__file__).parents[1])},
+            )
+
+    @property
+    def err(self) -> str:
+        """What it has said on standard error so far."""
+        return self._err.read_text()
+
+    @property
+    def running(self) -> bool:
+        return self._process.poll() is None
+
+    def end(self, number: signal.Signals | None = None) -> Ended:
+        """Send it a signal, if one is given, and wait for its end."""
+        if number is not None:
+            self._process.send_signal(number)
+        try:
+            status = self._process.wait(PATIENCE)
+        finally:
+            self.kill()
+        return Ended(status, self._out.read_text(), self.err)
+
+    def kill(self) -> None:
+        if self.running:
+            self._process.kill()
+            self._process.wait()
+
+
+class Peer:
+    """A node of the test's own. It does nothing unless the test waits."""
+
+    def __init__(self) -> None:
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context)
+        self.node = rclpy.create_node("peer", context=self._context)
+        self._executor = _executors.SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+    def until(self, happened: Callable[[], Any], what: str | Callable[[], str]) -> Any:
+        """Take messages until something is true; returns it. `what` is for the failure."""
+        deadline = time.monotonic() + PATIENCE
+        while not (value := happened()):
+            if time.monotonic() > deadline:
+                words = what if isinstance(what, str) else what()
+                raise AssertionError(f"waited in vain for {words}")
+            self._executor.spin_once(timeout_sec=0.05)
+        return value
+
+    def rest(self, seconds: float) -> None:
+        """Take messages for some time."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left)
+
+    def listen(self, kind: Any, topic: str, qos: Any = LATCHED) -> list[Any]:
+        """A list that grows by the messages of a topic."""
+        received: list[Any] = []
+        self.node.create_subscription(kind, topic, received.append, qos)
+        return received
+
+    def publisher(self, kind: Any, topic: str, qos: Any = RELIABLE, subscribers: int = 1) -> Any:
+        """A publisher that has its subscribers."""
+        publisher = self.node.create_publisher(kind, topic, qos)
+        self.until(
+            lambda: publisher.get_subscription_count() >= subscribers, f"a subscriber of {topic}"
+        )
+        return publisher
+
+    def ask(self, kind: Any, service: str, request: Any = None) -> Any:
+        """The future of a service's response."""
+        client = self.node.create_client(kind, service)
+        self.until(client.service_is_ready, service)
+        return client.call_async(request or kind.Request())
+
+    def call(self, kind: Any, service: str, request: Any = None) -> Any:
+        """The response of a service."""
+        answer = self.ask(kind, service, request)
+        self.until(answer.done, f"an answer of {service}")
+        return answer.result()
