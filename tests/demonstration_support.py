@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from mcap.writer import Writer
 
 from bnirl_ros.bags.qos import LATCHED, RELIABLE
 from bnirl_ros.bags.writer import BagWriter
@@ -146,3 +147,30 @@ def mcap_of(folder: Path) -> Path:
     """The one MCAP file of a bag."""
     (file,) = folder.glob("*.mcap")
     return file
+
+
+def write_odd_mcap(path: Path, topic: str) -> Path:
+    """An MCAP file with a message of a type that nobody knows."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2", "test")
+        schema = writer.register_schema("odd_msgs/msg/Odd", "ros2msg", b"float64 oddity")
+        channel = writer.register_channel(topic, "cdr", schema)
+        writer.add_message(channel, START, bytes(12), START)
+        writer.finish()
+    return path
+
+
+def bag_with_odd_topic(folder: Path) -> Path:
+    """The bag of a walk, in which /odd is of a type that nobody knows; returns its folder."""
+    write_bag(folder, [map_of_grid(), *walk()])
+    write_odd_mcap(folder / "odd.mcap", "/odd")
+    (folder / "metadata.yaml").unlink()  # it would name one of the two files
+    return folder
+
+
+def truncated(bag: Path, path: Path, share: float) -> Path:
+    """A file with the first part of a bag's MCAP file, that is so much of it."""
+    whole = mcap_of(bag).read_bytes()
+    path.write_bytes(whole[: int(len(whole) * share)])
+    return path

@@ -72,10 +72,14 @@ class NodeProcess:
     def running(self) -> bool:
         return self._process.poll() is None
 
+    def send(self, number: signal.Signals) -> None:
+        """Send it a signal."""
+        self._process.send_signal(number)
+
     def end(self, number: signal.Signals | None = None) -> Ended:
         """Send it a signal, if one is given, and wait for its end."""
         if number is not None:
-            self._process.send_signal(number)
+            self.send(number)
         try:
             status = self._process.wait(PATIENCE)
         finally:

@@ -4,32 +4,32 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 import re
-import os
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields
+from functools import partial
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
+import hypothesis
 import numpy as np
 import pytest
-import hypothesis
 from hypothesis import strategies as st
 
 from bag_support import messages, same
 from bnirl_ros import cli
 from bnirl_ros.bags.demonstration import read_demonstration
-from bnirl_ros.bags.reader import Bag
 from bnirl_ros.demonstrations.messages import stamp_of
 from bnirl_ros.demonstrations.placement import place
 from bnirl_ros.experiments.demonstration_bag import first_episodes, write_demonstration
 from bnirl_ros.experiments.scenarios import PAPER_LOOP
-from bnirl_ros.inference.settings import Settings
+from bnirl_ros.inference.settings import Settings, limits_of
 from bnirl_ros.maps import GridMap
-from bnirl_ros.views.messages import MESSAGE_TYPES, Message
+from bnirl_ros.views.messages import MESSAGE_TYPES
 from demonstration_support import (
     BAD_COUNTS,
     BAGS,
@@ -42,9 +42,10 @@ from demonstration_support import (
     TopicMessage,
     bad_maps,
     bad_messages,
+    bag_with_odd_topic,
     map_of_grid,
-    mcap_of,
     pose_at,
+    truncated,
     walk,
     write_bag,
 )
@@ -262,14 +263,10 @@ def replay_and_compare(
     return node
 
 
-@pytest.mark.parametrize("parameters", [{}, QUICK], ids=["defaults", "quick"])
 def test_after_a_replay_the_paper_loop_gives_the_posterior_of_the_command(
-    parameters: Mapping[str, Any],
-    tmp_path: Path,
-    start: StartNode,
-    subgoals: Callable[..., Subgoals],
+    tmp_path: Path, start: StartNode, subgoals: Callable[..., Subgoals]
 ) -> None:
-    replay_and_compare(PAPER_BAG, parameters, tmp_path, start, subgoals)
+    replay_and_compare(PAPER_BAG, {}, tmp_path, start, subgoals)
 
 
 def test_after_a_replay_human_play_gives_the_posterior_of_the_command(
@@ -387,18 +384,17 @@ def test_what_cannot_be_used_is_counted_and_the_rest_is_used(
     bad = list(bad_messages(START + 9000 * SECOND).values())
     maps = bad_maps()
 
-    def send_bad_maps(times: int) -> None:
-        for words, grid in maps.items():  # one by one: of those that wait, the last one is kept
-            node.send([("map", grid, START)])
-            node.until_fault(words, times)
-
-    send_bad_maps(times=1)
+    for words, grid in maps.items():  # one by one: of those that wait, the last one is kept
+        node.send([("map", grid, START)])
+        node.peer.until(lambda words=words: words in node.process.err, words)
     node.send(*bad[::2], [map_of_grid()], walk(), *bad[1::2])
     node.until_settled(OBSERVATIONS_OF_WALK)
-    send_bad_maps(times=2)
+    words, grid = next(iter(maps.items()))
+    node.send([("map", grid, START)])
+    node.until_fault(words, 2)
     node.until_settled(OBSERVATIONS_OF_WALK)
     node.until_shown(CORNER_PLACES)
-    health = node.until_health("all faults", drops=str(sum(BAD_COUNTS.values()) + 2 * len(maps)))
+    health = node.until_health("all faults", drops=str(sum(BAD_COUNTS.values()) + len(maps) + 1))
     for fault, count in BAD_COUNTS.items():
         assert health[f"left out: {fault}"] == str(count)
     assert health["level"] == 1
@@ -505,23 +501,320 @@ def test_callbacks_are_served_while_inference_runs(
     subgoals: Callable[..., Subgoals], peer: Peer, tmp_path: Path
 ) -> None:
     # Two inferences of a second or more, asked for at once.
-    node = subgoals(sweeps=30_000, burn_in=0, thin=100, result_folder=tmp_path)
+    node = subgoals(sweeps=8_000, burn_in=0, thin=100, result_folder=tmp_path)
     assert node.call("pause", services.SetBool.Request(data=True)).success
     node.send([map_of_grid()], walk(rounds=20))
     node.until_health("all", queue=str(20 * (2 * OBSERVATIONS_OF_WALK + 1)))
     answers = [peer.ask(services.Trigger, "/subgoal_node/infer") for _ in range(2)]
     request = parameter_services.GetParameters.Request(names=["alpha"])
     kind = parameter_services.GetParameters
-    slowest = 0.0
     served = 0
     while not all(answer.done() for answer in answers):
-        begin = time.monotonic()
-        assert (
-            peer.call(kind, "/subgoal_node/get_parameters", request).values[0].double_value == 50
-        )
-        slowest = max(slowest, time.monotonic() - begin)
+        (value,) = peer.call(kind, "/subgoal_node/get_parameters", request).values
+        assert value.double_value == 50.0
         served += 1
     assert all(answer.result().success for answer in answers)
     assert served > 5
-    # Far from the time of an inference, and far from what a busy machine does to a callback.
-    print(f"served {served}, the slowest in {slowest:.3f} s")
+
+
+# Parameters
+
+
+def test_parameters_are_described(subgoals: Callable[..., Subgoals]) -> None:
+    node = subgoals()
+    expected = {setting.name: limits_of(setting) for setting in fields(Settings)}
+    expected |= {entry.name: entry.limits for entry in PARAMETERS}
+    defaults = {setting.name: setting.default for setting in fields(Settings)}
+    defaults |= {entry.name: entry.default for entry in PARAMETERS}
+    names = list(expected)
+
+    kind = parameter_services.DescribeParameters
+    request = kind.Request(names=names)
+    told = node.peer.call(kind, "/subgoal_node/describe_parameters", request).descriptors
+    kind = parameter_services.GetParameters
+    request = kind.Request(names=names)
+    values = node.peer.call(kind, "/subgoal_node/get_parameters", request).values
+    types = {int: 2, float: 3, str: 4}
+    for name, each, value in zip(names, told, values, strict=True):
+        limits = expected[name]
+        assert each.name == name
+        assert each.description == limits.description
+        assert each.type == value.type == types[type(defaults[name])]
+        assert rclpy_parameter.parameter_value_to_python(value) == defaults[name]
+        if limits.choices:
+            assert all(str(choice) in each.additional_constraints for choice in limits.choices)
+        elif each.type != 4:
+            (bounds,) = each.integer_range or each.floating_point_range
+            assert bounds.from_value == max(limits.lowest, limits.above)
+            assert bounds.to_value == min(limits.highest, limits.below, bounds.to_value)
+            assert each.additional_constraints == limits.range_in_words()
+        assert each.read_only == (name in {entry.name for entry in PARAMETERS})
+
+
+def test_parameters_can_be_set_and_bad_values_are_refused_with_a_reason(
+    subgoals: Callable[..., Subgoals], tmp_path: Path
+) -> None:
+    node = subgoals(**QUICK, result_folder=tmp_path)
+    node.send([map_of_grid()], walk())
+    refused: dict[str, tuple[Any, str]] = {
+        "alpha": (-1.0, "alpha"),
+        "eta": (0.0, "eta must be above 0, not 0"),
+        "moves": (5, "moves must be one of 4, 8, not 5"),
+        "sweeps": (100, "sweeps must leave a draw: 100 sweeps less 100 of burn-in"),
+        "model": ("none", "model must be one of paper"),
+        "discount": (math.nan, "discount"),
+        "seed": ("text", "seed"),
+        "queue_depth": (1, "read-only"),
+        "waiting_limit": (1, "read-only"),
+        "episode_gap": (1.0, "read-only"),
+        "result_folder": ("elsewhere", "read-only"),
+    }
+    results = node.set(**{name: value for name, (value, _) in refused.items()})
+    for result, (name, (_, reason)) in zip(results, refused.items(), strict=True):
+        assert not result.successful, name
+        assert reason in result.reason
+    assert node.call("infer").success
+    document = json.loads((tmp_path / "subgoals.json").read_text())
+    assert document["model"]["alpha"] == 50.0  # nothing has changed
+
+    accepted = node.set(alpha=20.0, chains=2, burn_in=50)
+    assert all(result.successful for result in accepted), accepted
+    node.until_settled(OBSERVATIONS_OF_WALK)
+    assert node.call("infer").success
+    document = json.loads((tmp_path / "subgoals.json").read_text())
+    assert document["model"]["alpha"] == 20.0
+    assert document["diagnostics"]["chains"] == 2
+    assert document["diagnostics"]["draws"] == QUICK["sweeps"] - 50
+
+
+@pytest.mark.parametrize(
+    ("parameters", "sentence"),
+    [
+        ({"alpha": -1.0}, "parameter alpha: must be above 0"),
+        ({"alpha": 0.0}, "parameter alpha must be above 0, not 0.0"),
+        ({"alpha": "text"}, "parameter alpha: must be of type float, such as 50.0"),
+        ({"moves": 5}, "parameter moves must be one of 4, 8, not 5"),
+        ({"sweeps": 10, "burn_in": 10}, "sweeps must leave a draw: 10 sweeps less 10 of burn-in"),
+        ({"queue_depth": 0}, "parameter queue_depth: must be at least 1 and at most 1e+07"),
+    ],
+)
+def test_bad_parameters_at_the_start_are_one_sentence(
+    start: StartNode, parameters: Mapping[str, Any], sentence: str
+) -> None:
+    end = start("subgoal_node", *as_arguments(parameters)).end()
+    assert end.status == 1
+    assert end.err.startswith(f"subgoal_node: {sentence}")
+    assert end.err.count("\n") == 1
+
+
+# Replaying
+
+
+class Audience:
+    """Whoever listens to a replay, and when it heard what."""
+
+    def __init__(self, peer: Peer) -> None:
+        self.heard: dict[str, list[tuple[float, Any]]] = {name: [] for name in INPUTS}
+        for name, (kind, qos) in INPUTS.items():
+            peer.node.create_subscription(
+                message_class(kind), f"/{name}", partial(self._hear, name), qos
+            )
+
+    def _hear(self, name: str, message: Any) -> None:
+        self.heard[name].append((time.monotonic(), message))
+
+    def counts(self) -> dict[str, int]:
+        return {name: len(heard) for name, heard in self.heard.items()}
+
+    def stamps(self, name: str) -> list[int]:
+        return [stamp_of(message) for _, message in self.heard[name]]
+
+
+def test_a_replay_waits_loses_nothing_and_says_what_it_sent(
+    start: StartNode, peer: Peer, tmp_path: Path
+) -> None:
+    rounds = 40
+    sent = [map_of_grid(), *walk(rounds)]
+    process = start("replay_node", write_bag(tmp_path / "bag", sent), "--fast")
+    words = "waits for a subscriber of /action, /map, /pose"
+    peer.until(lambda: words in process.err, words)
+    infos = {
+        name: peer.until(
+            lambda name=name: peer.node.get_publishers_info_by_topic(f"/{name}"), f"/{name}"
+        )
+        for name in INPUTS
+    }
+    assert process.running
+
+    audience = Audience(peer)
+    expected = {name: sum(each == name for each, _, _ in sent) for name in INPUTS}
+    peer.until(lambda: audience.counts() == expected, lambda: str(audience.counts()))
+    for name in INPUTS:
+        assert audience.stamps(name) == [stamp for each, _, stamp in sent if each == name]
+    end = process.end()
+    assert end.status == 0
+    counts = ", ".join(f"/{name} {count}" for name, count in sorted(expected.items()))
+    assert end.out.splitlines()[-1] == f"sent {len(sent)} messages: {counts}"
+
+    # As recorded: the map latched, the rest reliable.
+    for name, (info,) in infos.items():
+        qos = info.qos_profile
+        assert qos.reliability == rclpy_qos.ReliabilityPolicy.RELIABLE
+        assert (qos.durability == rclpy_qos.DurabilityPolicy.TRANSIENT_LOCAL) == (name == "map")
+
+
+@pytest.mark.parametrize(("options", "factor"), [([], 1.0), (["--rate", "4"], 4.0)])
+def test_a_replay_keeps_pace(
+    start: StartNode, peer: Peer, tmp_path: Path, options: list[str], factor: float
+) -> None:
+    seconds = 2.0 * factor
+    sent = [each for each in [map_of_grid(), *walk()] if each[2] <= START + seconds * SECOND]
+    audience = Audience(peer)
+    begin = time.monotonic()
+    process = start("replay_node", write_bag(tmp_path / "bag", sent), *options)
+    peer.until(
+        lambda: sum(audience.counts().values()) == len(sent), lambda: str(audience.counts())
+    )
+    poses = audience.heard["pose"]
+    assert poses[-1][0] - begin >= 2.0  # whatever the machine is doing
+    assert audience.stamps("pose") == [stamp for name, _, stamp in sent if name == "pose"]
+    if factor > 1:
+        assert poses[-1][0] - poses[0][0] < seconds
+    assert process.end().status == 0
+
+
+def test_a_map_file_takes_the_place_of_a_map_that_is_missing(
+    start: StartNode, peer: Peer, tmp_path: Path
+) -> None:
+    (tmp_path / "map.txt").write_text(GRID)
+    without = write_bag(tmp_path / "without", walk(), topics=("pose", "action"))
+    audience = Audience(peer)
+    end = start("replay_node", without, "--fast", "--map", tmp_path / "map.txt").end()
+    assert end.status == 0
+    assert end.out == "sent 50 messages: /action 24, /map 1, /pose 25\n"
+    peer.until(lambda: audience.heard["map"], "the map")
+    ((_, grid),) = audience.heard["map"]
+    assert np.array_equal(np.array(grid.data) == 0, MAP.free.reshape(-1))
+
+    whole = write_bag(tmp_path / "whole", [map_of_grid(), *walk()])
+    end = start("replay_node", whole, "--fast", "--map", tmp_path / "map.txt").end()
+    assert end.status == 1
+    assert end.err.count("\n") == 1
+    assert "map.txt: the bag has a topic /map already; leave out --map" in end.err
+    end = start("replay_node", without, "--map", tmp_path / "none.txt").end()
+    assert end.status == 1
+    assert "none.txt: the map cannot be read" in end.err
+
+
+def test_what_cannot_be_played_is_said(start: StartNode, peer: Peer, tmp_path: Path) -> None:
+    end = start("replay_node", tmp_path / "none", "--fast").end()
+    assert (end.status, end.out) == (1, "")
+    assert end.err.startswith(f"replay_node: {tmp_path / 'none'}: does not exist")
+    assert end.err.count("\n") == 1
+    assert start("replay_node").end().status == 2
+    assert start("replay_node", PAPER_BAG, "--rate", "0").end().status == 2
+
+    audience = Audience(peer)
+    odd = bag_with_odd_topic(tmp_path / "bag")
+    end = start("replay_node", odd, "--fast").end()
+    assert end.status == 0
+    assert "/odd is not sent: type odd_msgs/msg/Odd isn't installed" in end.err
+    assert end.out == (
+        "sent 50 messages: /action 24, /map 1, /pose 25, "
+        "/odd not sent (type odd_msgs/msg/Odd isn't installed)\n"
+    )
+    expected = {"map": 1, "pose": 25, "action": 24}
+    peer.until(lambda: audience.counts() == expected, lambda: str(audience.counts()))
+
+
+def test_a_truncated_bag_is_played_as_far_as_it_goes(
+    start: StartNode, peer: Peer, tmp_path: Path
+) -> None:
+    path = truncated(PAPER_BAG, tmp_path / "cut.mcap", share=0.7)
+    audience = Audience(peer)
+    end = start("replay_node", path, "--fast").end()
+    assert end.status == 1
+    assert end.out == "sent 604 messages: /action 299, /map 1, /pose 304\n"
+    (line,) = (line for line in end.err.splitlines() if not line.startswith("["))
+    assert line.startswith(f"replay_node: {path}: is damaged at byte ")
+    assert "Traceback" not in end.err
+    peer.until(lambda: sum(audience.counts().values()) == 604, lambda: str(audience.counts()))
+
+
+# The end
+
+
+@pytest.fixture(params=[signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
+def number(request: pytest.FixtureRequest) -> signal.Signals:
+    return request.param
+
+
+@pytest.mark.parametrize("name", ["subgoal_node", "replay_node"])
+def test_a_signal_at_the_start_ends_a_node(
+    start: StartNode, number: signal.Signals, name: str
+) -> None:
+    # Python itself has to be there; what our code imports, and rclpy's start, take 0.7 s or more.
+    arguments = [PAPER_BAG] if name == "replay_node" else []
+    for after in (0.3, 0.6, 0.9):
+        process = start(name, *arguments)
+        time.sleep(after)
+        assert_silent_end(process, number)
+
+
+def test_a_signal_ends_the_subgoal_node_while_it_waits(
+    subgoals: Callable[..., Subgoals], number: signal.Signals
+) -> None:
+    assert_silent_end(subgoals().process, number)
+
+
+def test_a_signal_ends_the_subgoal_node_while_it_infers(
+    subgoals: Callable[..., Subgoals], number: signal.Signals
+) -> None:
+    node = subgoals(sweeps=5_000_000, burn_in=0, thin=200)
+    node.send([map_of_grid()], walk(rounds=2))
+    node.until_health("a running result", state="inferring", queue="0")
+    node.peer.ask(services.Trigger, "/subgoal_node/infer")
+    node.peer.rest(0.5)
+    assert_silent_end(node.process, number)
+
+
+def test_a_second_signal_changes_nothing(subgoals: Callable[..., Subgoals]) -> None:
+    node = subgoals()
+    node.process.send(signal.SIGINT)  # the terminal's, and that of `ros2 launch`
+    node.process.send(signal.SIGINT)
+    assert_silent_end(node.process, signal.SIGTERM)
+
+
+def test_a_signal_ends_the_replay_while_it_waits(
+    start: StartNode, peer: Peer, number: signal.Signals
+) -> None:
+    process = start("replay_node", PAPER_BAG)
+    peer.until(lambda: "waits for a subscriber" in process.err, "a replay that waits")
+    assert_silent_end(process, number)
+
+
+def test_a_signal_ends_the_replay_while_it_plays(
+    start: StartNode, peer: Peer, number: signal.Signals
+) -> None:
+    audience = Audience(peer)
+    process = start("replay_node", PAPER_BAG)
+    peer.until(lambda: len(audience.heard["pose"]) > 2, "a replay that plays")
+    end = process.end(number)
+    assert end.status == 0
+    assert "Traceback" not in end.err
+    assert re.fullmatch(r"sent \d+ messages: /action \d+, /map 1, /pose \d+\n", end.out)
+
+
+# Messages
+
+
+@pytest.mark.parametrize("name", sorted(MESSAGE_TYPES))
+@hypothesis.given(data=st.data())
+@hypothesis.settings(max_examples=20, deadline=None)
+def test_a_view_becomes_the_ros_message_with_the_same_fields(
+    name: str, data: st.DataObject
+) -> None:
+    view = data.draw(messages(name))
+    message = to_ros(view)
+    assert type(message) is message_class(name)
+    assert same(view, message)
