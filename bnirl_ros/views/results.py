@@ -127,12 +127,13 @@ def write_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
     little more space, and writes the time of day into the file.
     """
     with zipfile.ZipFile(path, "w") as archive:
+        write_array: Any = np.lib.format.write_array
         for name, values in arrays.items():
             member = zipfile.ZipInfo(f"{name}.npy")
             member.compress_type = zipfile.ZIP_DEFLATED
             member._compresslevel = 1  # type: ignore[attr-defined]
             with archive.open(member, "w", force_zip64=True) as file:
-                np.lib.format.write_array(file, np.ascontiguousarray(values), allow_pickle=False)
+                write_array(file, np.ascontiguousarray(values), allow_pickle=False)
 
 
 def _finite(value: float | None) -> float | None:
