@@ -101,6 +101,7 @@ class Peer:
         self.node = rclpy.create_node("peer", context=self._context)
         self._executor = _executors.SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
+        self._clients: dict[str, Any] = {}
 
     def close(self) -> None:
         self._executor.shutdown()
@@ -129,19 +130,26 @@ class Peer:
         self.node.create_subscription(kind, topic, received.append, qos)
         return received
 
-    def publisher(self, kind: Any, topic: str, qos: Any = RELIABLE, subscribers: int = 1) -> Any:
-        """A publisher that has its subscribers."""
+    def publisher(self, kind: Any, topic: str, qos: Any = RELIABLE) -> Any:
+        """A publisher that has a subscriber."""
         publisher = self.node.create_publisher(kind, topic, qos)
-        self.until(
-            lambda: publisher.get_subscription_count() >= subscribers, f"a subscriber of {topic}"
-        )
+        self.until(lambda: publisher.get_subscription_count() > 0, f"a subscriber of {topic}")
         return publisher
 
     def ask(self, kind: Any, service: str, request: Any = None) -> Any:
         """The future of a service's response."""
-        client = self.node.create_client(kind, service)
-        self.until(client.service_is_ready, service)
-        return client.call_async(request or kind.Request())
+        if service not in self._clients:
+            client = self._clients[service] = self.node.create_client(kind, service)
+            self.until(client.service_is_ready, service)
+            self.let_them_find_us()
+        return self._clients[service].call_async(request or kind.Request())
+
+    def let_them_find_us(self) -> None:
+        """Give the other side time to find us, as we have found it: for speed only.
+
+        What is sent before is not lost, but waits for what Fast DDS does every three seconds.
+        """
+        self.rest(0.2)
 
     def call(self, kind: Any, service: str, request: Any = None) -> Any:
         """The response of a service."""

@@ -248,6 +248,7 @@ class SubgoalNode(Node):
         self._outputs[name].publish(to_ros(view))
 
     def _publish_diagnostics(self) -> None:
+        self._look()  # whoever reads "settled" has the last result
         result = self._result
         faults = self._recorder.faults + self._faults
         if result:
