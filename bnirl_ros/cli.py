@@ -153,10 +153,11 @@ def _infer(options: argparse.Namespace) -> int:
     from bnirl_ros.inference.posterior import infer
     from bnirl_ros.inference.summary import summarise
     from bnirl_ros.views.plot import import_matplotlib
-    from bnirl_ros.views.results import write_results
+    from bnirl_ros.views.results import check_writable, write_results
     from bnirl_ros.views.tables import convergence, subgoal_table
 
     demonstration, grid_map, damage = _read(options, settings, remappings)
+    check_writable(options.out)
     Thread(target=import_matplotlib, daemon=True).start()  # while the chains leave the GIL alone
     with ExitStack() as stack:
         progress = _progress(stack, settings.sweeps * settings.chains)

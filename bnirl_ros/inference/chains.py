@@ -44,10 +44,11 @@ def run_chains(
         state = sampler.initial_state(mixture, generator)
         burnt = Draws.empty((1,), observations)  # where a chain is after part of the burn-in
         parts = [(burnt, sweeps) for sweeps in _parts(settings.burn_in, _SWEEPS_AT_ONCE)]
-        draws_at_once = max(1, _SWEEPS_AT_ONCE // settings.thin)
+        *between, last = _parts(settings.thin, _SWEEPS_AT_ONCE)
         start = 0
-        for count in _parts(settings.draws, draws_at_once):
-            parts.append((draws[chain][start : start + count], settings.thin))
+        for count in _parts(settings.draws, max(1, _SWEEPS_AT_ONCE // settings.thin)):
+            parts += [(burnt, sweeps) for sweeps in between]
+            parts.append((draws[chain][start : start + count], last))
             start += count
         for part, thin in parts:
             if stop.is_set():

@@ -157,7 +157,8 @@ def _show(out: Path) -> None:
 @contextmanager
 def _process(module: str, arguments: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
     """A node in a process of its own, told to end with SIGINT if it has not ended by itself."""
-    process = subprocess.Popen([sys.executable, "-m", f"bnirl_ros.nodes.{module}", *arguments])
+    program = f"from bnirl_ros.nodes import start; raise SystemExit(start.{module}())"
+    process = subprocess.Popen([sys.executable, "-c", program, *arguments])
     try:
         yield process
     finally:

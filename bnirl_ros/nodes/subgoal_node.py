@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,8 @@ from bnirl_ros.demonstrations.recording import Recorder
 from bnirl_ros.errors import InputError
 from bnirl_ros.inference.background import BackgroundInference, Result
 from bnirl_ros.inference.settings import Limits
-from bnirl_ros.inference.summary import nothing_found
+from bnirl_ros.inference.summary import Summary, nothing_found
+from bnirl_ros.maps.grid_map import GridMap
 from bnirl_ros.nodes.conversion import message_class, to_ros
 from bnirl_ros.nodes.parameters import NodeParameter, declare, declare_settings
 from bnirl_ros.nodes.process import run, spin
@@ -67,6 +68,9 @@ OUTPUTS = {
     "subgoal_belief": OccupancyGrid.TYPE,
 }
 """Message type of each topic that shows the posterior; all latched."""
+
+View = Callable[[Summary, GridMap, int], Message]
+"""Shows a summary on a map, in a message with this stamp [ns]."""
 
 _LOOK_PERIOD = 0.1  # [s] between two looks at whether there is a result
 _ASSIGNMENTS_PERIOD = 1.0  # [s] at the least between two messages on `assignments`
@@ -230,22 +234,20 @@ class SubgoalNode(Node):
         since = now - self._assignments_at
         if self._assignments_due and not 0 <= since < _ASSIGNMENTS_PERIOD * 1e9:
             assert self._result is not None
-            self._send("assignments", self._view(assignment_markers, self._result))
+            self._send("assignments", assignment_markers, self._result, now)
             self._assignments_due, self._assignments_at = False, now
 
     def _publish(self, result: Result) -> None:
         self._result = result
-        self._send("subgoals", self._view(subgoal_markers, result))
-        self._send("waypoints", self._view(waypoint_path, result))
-        self._send("subgoal_belief", self._view(belief_grid, result))
+        now = self.get_clock().now().nanoseconds
+        self._send("subgoals", subgoal_markers, result, now)
+        self._send("waypoints", waypoint_path, result, now)
+        self._send("subgoal_belief", belief_grid, result, now)
         self._assignments_due = True
 
-    def _view(self, view: Any, result: Result) -> Any:
+    def _send(self, name: str, view: View, result: Result, stamp: int) -> None:
         summary = result.summary or nothing_found(result.grid_map)
-        return view(summary, result.grid_map, self.get_clock().now().nanoseconds)
-
-    def _send(self, name: str, view: Message) -> None:
-        self._outputs[name].publish(to_ros(view))
+        self._outputs[name].publish(to_ros(view(summary, result.grid_map, stamp)))
 
     def _publish_diagnostics(self) -> None:
         self._look()  # whoever reads "settled" has the last result

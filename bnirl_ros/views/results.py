@@ -7,6 +7,7 @@ import math
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -51,11 +52,30 @@ def write_results(
             finally:
                 partial.unlink(missing_ok=True)
     except OSError as error:
-        raise InputError(
-            f"{folder}: the results cannot be written there ({error.strerror}); "
-            "choose another folder"
-        ) from error
+        raise _unwritable(folder, error) from error
     return [folder / name for name in writers]
+
+
+def check_writable(folder: Path) -> None:
+    """Find out whether results can be written, before time is spent on them.
+
+    Raises:
+        InputError: nothing can be written into the folder, or where it would be made.
+    """
+    place = folder
+    while not place.exists():
+        place = place.parent
+    try:
+        with TemporaryFile(dir=place):
+            pass
+    except OSError as error:
+        raise _unwritable(folder, error) from error
+
+
+def _unwritable(folder: Path, error: OSError) -> InputError:
+    return InputError(
+        f"{folder}: the results cannot be written there ({error.strerror}); choose another folder"
+    )
 
 
 def subgoals_document(summary: Summary, grid_map: GridMap, settings: Settings) -> dict[str, Any]:
