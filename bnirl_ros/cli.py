@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import gc
-import importlib.util
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -174,7 +173,9 @@ def _infer(options: argparse.Namespace) -> int:
 
 def _replay(arguments: Sequence[str]) -> int:
     """`bnirl replay`: the same as replay_node."""
-    _needs_ros()
+    from bnirl_ros.nodes.start import require_ros
+
+    require_ros()
     from bnirl_ros.nodes.replay_node import main as replay
 
     gc.enable()  # this may run for long
@@ -183,18 +184,13 @@ def _replay(arguments: Sequence[str]) -> int:
 
 def _demo(options: argparse.Namespace) -> int:
     """`bnirl demo`: both nodes, a human bag, and what comes of it."""
-    _needs_ros()
+    from bnirl_ros.nodes.start import require_ros
+
+    require_ros()
     from bnirl_ros.nodes.demo import main as demo
 
     gc.enable()  # this may run for long
     return demo(options.bag, options.out, options.alpha)
-
-
-def _needs_ros() -> None:
-    if importlib.util.find_spec("rclpy") is None:
-        raise InputError(
-            "rclpy is not installed; source a ROS 2 installation, or pip install 'bnirl_ros[ros]'"
-        )
 
 
 def _read(
