@@ -29,7 +29,7 @@ def grid_worlds(draw: st.DrawFn) -> GridWorld:
     )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(grid_worlds())
 def test_three_ways_to_the_values_of_goals_agree(world: GridWorld) -> None:
     steps = [(int(dx), int(dy)) for dx, dy in STEPS[world.actions]]

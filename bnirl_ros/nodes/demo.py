@@ -112,30 +112,28 @@ def demo(bag: Path, out: Path, alpha: float) -> None:
         node = stack.enter_context(_process("subgoal_node", ["--ros-args", *parameters]))
         replay = stack.enter_context(_process("replay_node", [str(bag), "--fast"]))
 
-        def ended(process: subprocess.Popen[bytes], name: str) -> bool:
-            if process.poll() is None:
-                tell(watcher.news())
-                return False
-            if process.returncode:
-                raise InputError(f"{name} ended with status {process.returncode}; see above")
-            return True
+        def replayed() -> bool:
+            _check(node, "subgoal_node", may_end=False)
+            tell(watcher.news())
+            return _check(replay, "replay_node", may_end=True)
 
         def settled() -> bool:
-            ended(node, "subgoal_node")
+            _check(node, "subgoal_node", may_end=False)
+            tell(watcher.news())
             known = watcher.diagnostics
             return known.get("queue") == "0" and known.get("state") == "settled"
 
-        def replayed() -> bool:
-            ended(node, "subgoal_node")
-            return ended(replay, "replay_node")
+        def answered() -> bool:
+            _check(node, "subgoal_node", may_end=False)
+            return bool(answer.done())
 
         watcher.spin_until("the replay", replayed)
         watcher.spin_until("the inference", settled)
         tell("asks for an inference with fresh chains")
         answer = watcher.infer.call_async(Trigger.Request())
-        watcher.spin_until("the inference", lambda: answer.done() or ended(node, "subgoal_node"))
-        if not answer.done() or not answer.result().success:
-            raise InputError(answer.result().message if answer.done() else "subgoal_node ended")
+        watcher.spin_until("the inference", answered)
+        if not answer.result().success:
+            raise InputError(answer.result().message)
     _show(out)
 
 
@@ -152,6 +150,18 @@ def _show(out: Path) -> None:
     print(f"Picture: {out / 'subgoals.png'}")
     print(f"Subgoals and posterior: {out / 'subgoals.json'}, {out / 'posterior.npz'}")
     print(f"What was published, for Foxglove or ros2 bag play: {out / 'published'}")
+
+
+def _check(process: subprocess.Popen[bytes], name: str, may_end: bool) -> bool:
+    """Whether a node has ended.
+
+    Raises:
+        InputError: it ended with an error, or at all where it may not.
+    """
+    status = process.poll()
+    if status or (status is not None and not may_end):
+        raise InputError(f"{name} ended with status {status}; its messages above say why")
+    return status is not None
 
 
 @contextmanager
