@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 import gc
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import fields
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from bnirl_ros import __version__
 from bnirl_ros.errors import InputError
@@ -230,25 +230,35 @@ def _read(
     return placement.demonstration, grid_map, recorded.damage
 
 
-def _progress(stack: ExitStack, total: int) -> Any:
-    """A progress bar of sweeps on a terminal's standard error; nothing elsewhere."""
+def _progress(stack: ExitStack, total: int) -> Callable[[int], None] | None:
+    """A progress bar on a terminal's standard error, told of sweeps; nothing elsewhere."""
     if not sys.stderr.isatty():
         return None
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+    )
 
     bar = stack.enter_context(
         Progress(
-            "Sampling",
+            TextColumn("{task.description}"),
             BarColumn(),
             TaskProgressColumn(),
-            TimeRemainingColumn(),
+            TimeElapsedColumn(),
             console=Console(stderr=True),
             transient=True,
         )
     )
-    task = bar.add_task("", total=total)
-    return lambda sweeps: bar.advance(task, sweeps)
+    task = bar.add_task("Solving the goals", total=None)
+
+    def advance(sweeps: int) -> None:
+        bar.update(task, description="Sampling", total=total, advance=sweeps)
+
+    return advance
 
 
 def _warn(sentence: str) -> None:

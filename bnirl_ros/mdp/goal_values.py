@@ -70,7 +70,11 @@ def goal_values(
         )
 
     with ThreadPoolExecutor(os.cpu_count()) as threads:
-        list(threads.map(solve, range(0, len(goal_states), _GOALS_AT_ONCE)))
+        try:
+            list(threads.map(solve, range(0, len(goal_states), _GOALS_AT_ONCE)))
+        except BaseException:
+            threads.shutdown(wait=False, cancel_futures=True)  # Ctrl-C waits for one batch only
+            raise
     return values
 
 
