@@ -31,6 +31,7 @@ _DEPTH = 1000  # of a reliable publisher at least that plays at a pace
 # small: what overflows the transport is sent again at 256 messages in three seconds.
 _ROUND = 50
 _LOOK_PERIOD = 0.05  # [s] between two looks at subscribers, and at whether to stop
+_STILL = 0.5  # [s] without a further subscriber, after which nobody is waited for any more
 _STUCK_AFTER = 10.0  # [s] without acknowledgement after which a subscriber is given up
 
 
@@ -71,7 +72,10 @@ class ReplayNode(Node):
             self._announce(topic)
 
     def wait_for_subscribers(self, patience: float) -> None:
-        """Wait until every topic has a subscriber; says for whom, and after a while goes on."""
+        """Wait until every topic has a subscriber, and a moment more for those still coming.
+
+        Says for whom it waits, and goes on without them when patience is at its end.
+        """
         deadline = time.monotonic() + patience
         tell_at = time.monotonic() + 1.0
         while missing := self._without_subscriber():
@@ -84,6 +88,13 @@ class ReplayNode(Node):
                 self.get_logger().info(f"waits for a subscriber of {', '.join(missing)}")
                 tell_at = deadline
             time.sleep(_LOOK_PERIOD)
+        # A recorder beside the first subscriber is found a little later, and a short replay would
+        # be over by then.
+        counts, still_until = self._subscriber_counts(), time.monotonic() + _STILL
+        while time.monotonic() < still_until:
+            time.sleep(_LOOK_PERIOD)
+            if self._subscriber_counts() != counts:
+                counts, still_until = self._subscriber_counts(), time.monotonic() + _STILL
 
     def publish_map(self, path: Path) -> None:
         """Publish a map file on /map, latched.
@@ -167,12 +178,14 @@ class ReplayNode(Node):
             kind, topic.name, qos_profile(recorded)
         )
 
-    def _without_subscriber(self) -> list[str]:
-        return [
-            topic
+    def _subscriber_counts(self) -> dict[str, int]:
+        return {
+            topic: publisher.get_subscription_count()
             for topic, publisher in self._topic_publishers.items()
-            if publisher.get_subscription_count() == 0
-        ]
+        }
+
+    def _without_subscriber(self) -> list[str]:
+        return [topic for topic, count in self._subscriber_counts().items() if count == 0]
 
 
 def qos_profile(recorded: QosProfile) -> QoSProfile:
