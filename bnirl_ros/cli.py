@@ -51,6 +51,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     from bnirl_ros.demonstrations.placement import EPISODE_GAP
+    from bnirl_ros.inference.settings import above_zero
 
     infer = commands.add_parser("infer", help="infer the subgoals of a recorded demonstration")
     infer.add_argument(
@@ -72,7 +73,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_settings(infer)
     infer.add_argument(
         "--episode-gap",
-        type=_above_zero,
+        type=above_zero,
         default=EPISODE_GAP,
         metavar="SECONDS",
         help="longest time between two poses of one episode (%(default)s)",
@@ -85,7 +86,7 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument("--bag", type=Path, help="another bag than the human demonstration")
     demo.add_argument(
         "--alpha",
-        type=_above_zero,
+        type=above_zero,
         default=5.0,
         help="confidence; lower than that of infer, since people dither (%(default)s)",
     )
@@ -94,13 +95,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     demo.set_defaults(run=_demo)
     return parser
-
-
-def _above_zero(text: str) -> float:
-    value = float(text)
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"must be above 0, not {text}")
-    return value
 
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import math
 from dataclasses import Field, dataclass, field, fields
 from typing import Any
@@ -123,3 +124,11 @@ class Settings:
     def draws(self) -> int:
         """Draws kept from each chain."""
         return (self.sweeps - self.burn_in) // self.thin
+
+
+def above_zero(text: str) -> float:
+    """A finite number above 0 from a command line, for argparse."""
+    value = float(text)
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"must be above 0, not {text}")
+    return value

@@ -19,6 +19,7 @@ from rclpy.utilities import remove_ros_args
 from bnirl_ros.bags.qos import LATCHED, QosProfile
 from bnirl_ros.bags.reader import Bag, RawMessage, Topic
 from bnirl_ros.errors import InputError
+from bnirl_ros.inference.settings import above_zero
 from bnirl_ros.maps import load_map
 from bnirl_ros.nodes.conversion import message_class, to_ros
 from bnirl_ros.nodes.process import run
@@ -239,7 +240,7 @@ def parse(arguments: Sequence[str], name: str = "replay_node") -> Options:
     pace.add_argument(
         "-r",
         "--rate",
-        type=_positive,
+        type=above_zero,
         default=1.0,
         help="factor on the recorded pace (%(default)s)",
     )
@@ -247,7 +248,7 @@ def parse(arguments: Sequence[str], name: str = "replay_node") -> Options:
     parser.add_argument("--map", type=Path, help="map file to publish on /map for a bag without")
     parser.add_argument(
         "--wait",
-        type=_positive,
+        type=above_zero,
         default=10.0,
         metavar="SECONDS",
         help="how long to wait for a subscriber of every topic (%(default)s)",
@@ -255,13 +256,6 @@ def parse(arguments: Sequence[str], name: str = "replay_node") -> Options:
 
     given = parser.parse_args(arguments)
     return Options(given.bag, None if given.fast else given.rate, given.map, given.wait)
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"must be above 0, not {text}")
-    return value
 
 
 def main(arguments: Sequence[str] | None = None, name: str = "replay_node") -> int:
