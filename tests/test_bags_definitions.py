@@ -57,7 +57,7 @@ def test_a_definition_holds_every_type_once_depth_first() -> None:
 @needs_ros_definitions
 @needs_shared_bags
 def test_the_layout_is_that_of_a_recorded_bag(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the installed definitions in place of ours, as the bag's types are not among ours."""
+    """With the installed definitions in place of ours, as not all of the bags' types are ours."""
 
     def installed_text(name: str) -> str:
         return installed(name, ".msg").read_text()

@@ -109,6 +109,15 @@ class Vector3Stamped(Message):
 
 
 @dataclass(eq=False)
+class Twist(Message):
+    """geometry_msgs/msg/Twist: velocities along [m/s] and about [rad/s] the body's axes."""
+
+    TYPE: ClassVar[str] = "geometry_msgs/msg/Twist"
+    linear: Vector3 = field(default_factory=Vector3)
+    angular: Vector3 = field(default_factory=Vector3)
+
+
+@dataclass(eq=False)
 class Quaternion(Message):
     """geometry_msgs/msg/Quaternion: a rotation, by default none."""
 
