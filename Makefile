@@ -10,6 +10,8 @@ WITH ?=
 PYTEST_ARGS ?=
 # The folder with the recordings of human play, for `make bags`.
 OVERCOOKED ?= ../shared/data/overcooked
+# The recording of a turtlesim robot, for `make bags`.
+TURTLE ?= ../shared/data/bags/turtle_waypoints
 
 BIN := $(VENV)/bin
 export PYTHON WITH
@@ -42,7 +44,8 @@ unit: venv  ## Run the tests, without the checks of style and types
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 bags: venv  ## Make the bags in bags/ again
-	$(BIN)/python -m bnirl_ros.experiments.make_bags --overcooked "$(OVERCOOKED)"
+	$(BIN)/python -m bnirl_ros.experiments.make_bags --overcooked "$(OVERCOOKED)" \
+		--turtle "$(TURTLE)"
 
 benchmark: venv  ## Time the main job and its parts
 	$(BIN)/python benchmarks/main_job.py

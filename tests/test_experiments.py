@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 import zstandard
 
+from bag_support import SHARED_BAGS, needs_shared_bags
 from bnirl_ros.bags.demonstration import read_demonstration
 from bnirl_ros.bags.reader import Bag
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.demonstrations.placement import place
 from bnirl_ros.errors import InputError
-from bnirl_ros.experiments import make_bags, overcooked
+from bnirl_ros.experiments import make_bags, overcooked, turtle
 from bnirl_ros.experiments.demonstration_bag import (
     BEGINNING,
     SIZE_LIMIT,
@@ -40,6 +41,7 @@ from bnirl_ros.mdp.goal_values import goal_values
 
 BAGS = Path(__file__).resolve().parents[1] / "bags"
 RECORDINGS = Path(__file__).resolve().parents[2] / "shared" / "data" / "overcooked"
+TURTLE = SHARED_BAGS / "turtle_waypoints"
 
 needs_recordings = pytest.mark.skipif(
     not RECORDINGS.is_dir(), reason="the recordings of ../shared/data are not on this machine"
@@ -50,14 +52,17 @@ needs_the_same_zstd = pytest.mark.skipif(
     zstandard.ZSTD_VERSION != (1, 5, 7), reason="the bags were compressed by Zstandard 1.5.7"
 )
 
-NAMES = ["paper_loop", "overcooked_random3", "overcooked_asymmetric_advantages"]
-EPISODES = dict(zip(NAMES, (5, 16, 18), strict=True))
+EPISODES = {
+    "paper_loop": 5,
+    "overcooked_random3": 16,
+    "overcooked_asymmetric_advantages": 18,
+    "turtle_waypoints": 1,
+}
+NAMES = list(EPISODES)
 
 # Those made of recordings can be made again only where these are.
-REMAKABLE = [
-    pytest.param(name, marks=needs_recordings) if name.startswith("overcooked") else name
-    for name in NAMES
-]
+NEEDS = {"paper": (), "overcooked": needs_recordings, "turtle": needs_shared_bags}
+REMAKABLE = [pytest.param(name, marks=NEEDS[name.partition("_")[0]]) for name in NAMES]
 
 CSV = """\
 episode,t,x,y,action,interact_ok
@@ -75,6 +80,8 @@ def original(name: str) -> tuple[Demonstration, GridMap]:
     """What a bag was made of."""
     if name in SCENARIOS:
         return shipped_demonstration(SCENARIOS[name]), SCENARIOS[name].grid_map
+    if name == "turtle_waypoints":
+        return turtle.read_turtle(TURTLE)
     return overcooked.read_overcooked(RECORDINGS, name.removeprefix("overcooked_"))
 
 
@@ -82,6 +89,8 @@ def make(name: str, out: Path) -> Path:
     """Make a bag again."""
     if name in SCENARIOS:
         return make_bags.make_scenario_bag(SCENARIOS[name], out)
+    if name == "turtle_waypoints":
+        return make_bags.make_turtle_bag(TURTLE, out)
     bag, _ = make_bags.make_overcooked_bag(RECORDINGS, name.removeprefix("overcooked_"), out)
     return bag
 
@@ -193,9 +202,13 @@ def test_the_map_of_a_shipped_bag_is_latched_and_first(name: str) -> None:
     assert (first.topic, first.log_time) == ("/map", BEGINNING)
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name.startswith("overcooked")])
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in SCENARIOS])
 def test_recordings_of_others_come_with_their_licence(name: str) -> None:
-    assert (BAGS / name / "LICENSE").read_text(encoding="utf-8") == overcooked.LICENCE
+    licence = overcooked.LICENCE
+    if name == "turtle_waypoints":
+        # The recording's licence is that of this package too.
+        licence = turtle.NOTICE + (BAGS.parent / "LICENSE").read_text(encoding="utf-8")
+    assert (BAGS / name / "LICENSE").read_text(encoding="utf-8") == licence
 
 
 @pytest.mark.parametrize("name", REMAKABLE)
@@ -324,10 +337,21 @@ def test_missing_recordings_are_named_and_the_rest_is_made(
         overcooked.read_overcooked(source, "tiny")
 
 
+@needs_shared_bags
+def test_a_recording_of_the_turtle_needs_its_licence(tmp_path: Path) -> None:
+    (file,) = TURTLE.glob("*.mcap")
+    shutil.copy(file, tmp_path)
+    with pytest.raises(InputError, match=r"LICENSE: cannot be read; put the recording's licence"):
+        make_bags.make_turtle_bag(tmp_path, tmp_path / "bags")
+    assert not (tmp_path / "bags").exists()
+
+
 @needs_recordings
+@needs_shared_bags
 def test_the_command_leaves_other_files_alone(tmp_path: Path) -> None:
     shutil.copytree(BAGS / "paper_loop", tmp_path / "paper_loop")
     (tmp_path / "paper_loop" / "NOTES").touch()
-    assert make_bags.main(["--overcooked", str(RECORDINGS), "--out", str(tmp_path)]) == 0
+    sources = ["--overcooked", str(RECORDINGS), "--turtle", str(TURTLE)]
+    assert make_bags.main([*sources, "--out", str(tmp_path)]) == 0
     assert (tmp_path / "paper_loop" / "NOTES").is_file()
     assert {path.name for path in tmp_path.iterdir()} == set(NAMES)

@@ -9,8 +9,10 @@ import numpy.typing as npt
 import pytest
 
 from bag_support import SHARED_BAGS, needs_shared_bags
+from bnirl_ros.bags.demonstration import read_demonstration
 from bnirl_ros.bags.qos import RELIABLE
 from bnirl_ros.bags.writer import BagWriter
+from bnirl_ros.demonstrations.placement import place
 from bnirl_ros.errors import InputError
 from bnirl_ros.experiments.turtle import (
     SIDE,
@@ -27,6 +29,7 @@ from bnirl_ros.mdp.actions import ACTION_NAMES
 from bnirl_ros.views.messages import Twist, Vector3
 
 RECORDING = SHARED_BAGS / "turtle_waypoints"
+SHIPPED = Path(__file__).resolve().parents[1] / "bags" / "turtle_waypoints"
 
 MIDDLE = (5.0, 5.0, 0.0)
 
@@ -152,3 +155,15 @@ def test_the_recorded_drive_passes_the_waypoints_in_the_authors_order() -> None:
     # It halts at the first one again, and breaks off in its second lap on the way to the fifth.
     np.testing.assert_allclose(away[(times > 59.4) & (times < 61.5), 0], 0.283, atol=0.001)
     assert (away[times > 61.6].min(axis=0) < 1.0).tolist() == [True] * 4 + [False] * 2
+
+
+@needs_shared_bags
+def test_the_shipped_bag_is_the_recorded_drive() -> None:
+    demonstration, grid_map = read_turtle(RECORDING)
+    recorded = read_demonstration(SHIPPED, {})
+    assert recorded.grid_map is not None
+    placed = place(recorded.recording, recorded.grid_map).demonstration
+    np.testing.assert_array_equal(placed.observations, demonstration.observations)
+    np.testing.assert_array_equal(placed.last_cells, demonstration.last_cells)
+    np.testing.assert_array_equal(recorded.grid_map.free, grid_map.free)
+    assert recorded.grid_map.resolution == grid_map.resolution

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bnirl_ros.errors import InputError
-from bnirl_ros.experiments import overcooked
+from bnirl_ros.experiments import overcooked, turtle
 from bnirl_ros.experiments.demonstration_bag import (
     bag_size,
     write_demonstration,
@@ -54,6 +54,31 @@ def make_overcooked_bag(source: Path, layout: str, out: Path) -> tuple[Path, int
     return bag, episodes
 
 
+def make_turtle_bag(source: Path, out: Path) -> Path:
+    """Write the bag `turtle_waypoints`, and its licence, into the folder `out`; returns the bag.
+
+    Args:
+        source: folder with the recording and its `LICENSE`, see `turtle.read_turtle`.
+        out: where the bag goes.
+
+    Raises:
+        InputError: the recording or its licence is missing or wrong.
+    """
+    demonstration, grid_map = turtle.read_turtle(source)
+    licence = source / LICENCE_FILE
+    try:
+        text = licence.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        raise InputError(
+            f"{licence}: cannot be read; put the recording's licence there, it has to go with the "
+            "bag"
+        ) from None
+    bag = out / "turtle_waypoints"
+    write_demonstration(bag, demonstration, grid_map, turtle.STEP)
+    (bag / LICENCE_FILE).write_text(turtle.NOTICE + text, encoding="utf-8")
+    return bag
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status: 0, 1 for missing or wrong recordings."""
     parser = argparse.ArgumentParser(
@@ -67,6 +92,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="human play to convert: <layout>.csv and <layout>.grid.txt (%(default)s)",
     )
     parser.add_argument(
+        "--turtle",
+        type=Path,
+        metavar="FOLDER",
+        default=Path("../shared/data/bags/turtle_waypoints"),
+        help="recording of a driven turtlesim robot to convert (%(default)s)",
+    )
+    parser.add_argument(
         "--out", type=Path, default=Path("bags"), help="folder for the bags (%(default)s)"
     )
     options = parser.parse_args(arguments)
@@ -77,6 +109,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for layout in LAYOUTS:
             bag, episodes = make_overcooked_bag(options.overcooked, layout, options.out)
             print(f"{bag}: {episodes} episodes, {bag_size(bag)} bytes")
+        bag = make_turtle_bag(options.turtle, options.out)
+        print(f"{bag}: 1 episode, {bag_size(bag)} bytes")
     except InputError as error:
         print(f"make_bags: {error}", file=sys.stderr)
         return 1
