@@ -17,12 +17,14 @@ class Subgoal:
     """One subgoal of the posterior mode.
 
     Attributes:
-        rank: 1 for the subgoal with most observations, and so on.
+        rank: 1 for the subgoal with most observations, or, where the model knows pursuits, with
+            most of them, and so on.
         cell: (x, y) on the map, (0, 0) at the lower left.
         position: centre of the cell (x, y) in the map frame [m].
         probability: share of the posterior draws in which the cell is a subgoal.
         observations: number of observations that the mode assigns to it.
         visit_order: 1-based positions in the visits of the first episode that visits it.
+        pursuits: expected number of pursuits of it; None for a model that knows none.
     """
 
     rank: int
@@ -31,6 +33,44 @@ class Subgoal:
     probability: float
     observations: int
     visit_order: tuple[int, ...]
+    pursuits: float | None = None
+
+
+@dataclass(frozen=True)
+class Pursuit:
+    """A maximal run of observations of one episode with one subgoal, slips among them or not.
+
+    Attributes:
+        episode: its number.
+        rank: of the subgoal.
+        first, last: the first and the last observation that the subgoal explains, by their rows
+            in `Summary.observations`.
+        arrived: whether the demonstrator was at the subgoal, after `first` was observed and by
+            the pose that follows `last`.
+    """
+
+    episode: int
+    rank: int
+    first: int
+    last: int
+    arrived: bool
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """What is known of a parameter of the model.
+
+    Attributes:
+        name: as in `bnirl_ros.inference.settings.Settings`.
+        median: of the posterior; the value where it is fixed.
+        interval: central 90 % of the posterior; both ends the value where it is fixed.
+        inferred: whether it was inferred rather than fixed.
+    """
+
+    name: str
+    median: float
+    interval: tuple[float, float]
+    inferred: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +81,19 @@ class Summary:
         subgoals: those of the posterior mode, by rank.
         visit_sequence: ranks in the order in which the demonstrator first visited them.
         observations: (N, 4) int64: episode, x, y, action index, in canonical order.
-        rank_of: (N,) int64: rank of the subgoal to which the mode assigns each observation.
+        rank_of: (N,) int64: rank of the subgoal to which the mode assigns each observation; 0 for
+            an unexplained one.
         cell_probability: (height, width) float64: posterior probability that a cell is a subgoal.
         rhat: split R-hat, the larger one of log joint and number of partitions; None where it is
             undefined (one chain, or no variance).
         ess: effective sample size, the smaller one of the same two; None where undefined.
         chains, draws: number of chains, and of draws kept in each.
+        pursuits: those of the mode, in the order of the observations; empty for a model that
+            knows none.
+        repetitions: how often the pursuits go round the visit sequence, the last time perhaps not
+            to its end; 0 where they are no loop.
+        unexplained: expected share of observations that no subgoal explains.
+        parameters: of the model, inferred or fixed.
     """
 
     subgoals: tuple[Subgoal, ...]
@@ -58,6 +105,10 @@ class Summary:
     ess: float | None
     chains: int
     draws: int
+    pursuits: tuple[Pursuit, ...] = ()
+    repetitions: int = 0
+    unexplained: float = 0.0
+    parameters: tuple[Parameter, ...] = ()
 
 
 def summarise(posterior: Posterior, grid_map: GridMap) -> Summary:
