@@ -99,18 +99,19 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
     """An option for every setting, with its range and default."""
-    from bnirl_ros.inference.settings import Settings, limits_of
+    from bnirl_ros.inference.settings import Settings, kind_of, limits_of
 
     for setting in fields(Settings):
         limits = limits_of(setting)
         words = limits.range_in_words()
         parser.add_argument(
             "--" + setting.name.replace("_", "-"),
-            type=type(setting.default),
+            type=kind_of(setting),
             default=setting.default,
             choices=limits.choices or None,
             metavar=None if limits.choices else setting.name.upper(),
-            help=f"{limits.description}{', ' * bool(words)}{words} (%(default)s)",
+            help=(f"{limits.description}{', ' * bool(words)}{words}").replace("%", "%%")
+            + ("" if setting.default is None else " (%(default)s)"),
         )
 
 

@@ -31,6 +31,11 @@ class Demonstration:
         return len(self.action)
 
     @property
+    def starts(self) -> npt.NDArray[np.bool_]:
+        """(N,) which observations begin an episode."""
+        return np.diff(self.episode, prepend=-1) != 0
+
+    @property
     def observations(self) -> npt.NDArray[np.int64]:
         """(N, 4) int64: episode, x, y, action index."""
         return np.column_stack([self.episode, self.cells, self.action])

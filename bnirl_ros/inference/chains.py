@@ -9,10 +9,9 @@ from threading import Event
 
 import numpy as np
 
-from bnirl_ros.inference import partition_gibbs as sampler
 from bnirl_ros.inference.draws import Draws
+from bnirl_ros.inference.samplers import Model, sampler_of
 from bnirl_ros.inference.settings import Settings
-from bnirl_ros.model.mixture import SubgoalMixture
 
 _SWEEPS_AT_ONCE = 50  # between two looks at whether to stop
 
@@ -25,7 +24,7 @@ class StoppedError(Exception):
 
 
 def run_chains(
-    mixture: SubgoalMixture,
+    model: Model,
     settings: Settings,
     progress: Progress | None = None,
     stop: Event | None = None,
@@ -36,13 +35,13 @@ def run_chains(
         StoppedError: `stop` was set meanwhile.
     """
     stop = stop or Event()
-    observations = len(mixture.pair_of)
-    draws = Draws.empty((settings.chains, settings.draws), observations)
+    sampler = sampler_of(model)
+    draws = sampler.room_for(model, (settings.chains, settings.draws))
 
     def run_chain(chain: int, seed: np.random.SeedSequence) -> None:
         generator = np.random.default_rng(seed)
-        state = sampler.initial_state(mixture, generator)
-        burnt = Draws.empty((1,), observations)  # where a chain is after part of the burn-in
+        state = sampler.initial_state(model, generator)
+        burnt = sampler.room_for(model, (1,))  # where a chain is after part of the burn-in
         parts = [(burnt, sweeps) for sweeps in _parts(settings.burn_in, _SWEEPS_AT_ONCE)]
         *between, last = _parts(settings.thin, _SWEEPS_AT_ONCE)
         start = 0
@@ -53,7 +52,7 @@ def run_chains(
         for part, thin in parts:
             if stop.is_set():
                 raise StoppedError
-            sampler.advance(mixture, state, generator, part, thin)
+            sampler.advance(model, state, generator, part, thin)
             if progress:
                 progress(len(part) * thin)
 

@@ -13,28 +13,33 @@ class Draws:
     """What a chain leaves behind; with a further leading axis, what several chains do.
 
     Attributes:
-        subgoal_of: (draw, N) int32 candidate index of each observation's subgoal.
+        subgoal_of: (draw, N) int32 candidate index of each observation's subgoal; -1 for a slip.
         partition_of: (draw, N) int32 partition of each observation, numbered from 0 in the order
-            of their first observations: two draws with the same partition are equal arrays.
-        log_joint: (draw,) float64 log of (10).
+            of their first observations: two draws with the same partition are equal arrays; -1
+            for a slip.
+        log_joint: (draw,) float64 log joint of the model: of (10) for the paper's.
+        parameters: (draw, P) float64 the parameters that are drawn too; P = 0 for the paper's
+            model, else those of `bnirl_ros.model.pursuits.PRIORS`, in their order.
     """
 
     subgoal_of: npt.NDArray[np.int32]
     partition_of: npt.NDArray[np.int32]
     log_joint: npt.NDArray[np.float64]
+    parameters: npt.NDArray[np.float64]
 
     @classmethod
-    def empty(cls, shape: tuple[int, ...], observations: int) -> Draws:
+    def empty(cls, shape: tuple[int, ...], observations: int, parameters: int = 0) -> Draws:
         """Room for draws: `shape` is (draws,) or (chains, draws)."""
         return cls(
             subgoal_of=np.empty((*shape, observations), dtype=np.int32),
             partition_of=np.empty((*shape, observations), dtype=np.int32),
             log_joint=np.empty(shape, dtype=np.float64),
+            parameters=np.empty((*shape, parameters), dtype=np.float64),
         )
 
     def __getitem__(self, key: int | slice) -> Draws:
         """A part along the leading axis, as a view."""
-        return Draws(self.subgoal_of[key], self.partition_of[key], self.log_joint[key])
+        return Draws(*(values[key] for values in vars(self).values()))
 
     def __len__(self) -> int:
         return len(self.log_joint)

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from numba import njit
 
 from bnirl_ros.inference.draws import Draws
+from bnirl_ros.inference.random_draws import categorical
 from bnirl_ros.model.mixture import SubgoalMixture
 
 
@@ -90,44 +91,48 @@ def _state(partition_of: npt.NDArray[np.int64], subgoals: npt.NDArray[np.int64])
     )
 
 
+def room_for(mixture: SubgoalMixture, shape: tuple[int, ...]) -> Draws:
+    """Draws still to be filled: `shape` is (draws,) or (chains, draws)."""
+    return Draws.empty(shape, len(mixture.pair_of))
+
+
 def initial_state(mixture: SubgoalMixture, generator: np.random.Generator) -> PartitionState:
     """Step 1(b) of Algorithm 2: one partition, its subgoal drawn from the prior."""
     subgoal = generator.choice(len(mixture.log_prior), p=np.exp(mixture.log_prior))
     return _state(np.zeros(len(mixture.pair_of), dtype=np.int64), np.array([subgoal]))
 
 
-def seat(
+def going_on(
     mixture: SubgoalMixture,
-    partition_of: npt.ArrayLike,
-    subgoal_of: npt.ArrayLike,
+    state: PartitionState,
+    row_before: npt.NDArray[np.int64],
+    candidate_now: npt.NDArray[np.int64],
     generator: np.random.Generator,
 ) -> PartitionState:
-    """A state that goes on from an older one, with observations that are new to it.
+    """A state of a changed demonstration that goes on from an older one.
+
+    What was observed then keeps its partition and subgoal, as far as the subgoal is still a
+    candidate; other observations are seated one by one by (14) given those before.
 
     Args:
-        mixture: the model of all N observations.
-        partition_of: (N,) partition of each observation, any numbers; -1 for the new ones, which
-            are seated one by one by (14) given those before.
-        subgoal_of: (N,) candidate index of each observation's subgoal; -1 for the new ones.
+        mixture: the model of the observations now.
+        state: of the observations before.
+        row_before: (N,) row of each observation before; -1 for a new one.
+        candidate_now: (G before,) index of each candidate now; -1 for none.
         generator: source of randomness.
     """
-    partitions = np.array(partition_of, dtype=np.int64)
-    known = partitions >= 0
-    if not known.any():
+    partitions = np.full(len(row_before), -1, dtype=np.int64)
+    known = np.flatnonzero(row_before >= 0)
+    slots = state.partition_of[row_before[known]]
+    subgoals = candidate_now[state.subgoal_of_slot[slots]]
+    known, slots, subgoals = (values[subgoals >= 0] for values in (known, slots, subgoals))
+    if not len(known):
         return initial_state(mixture, generator)
-    _, first, number = np.unique(partitions[known], return_index=True, return_inverse=True)
+    _, first, number = np.unique(slots, return_index=True, return_inverse=True)
     partitions[known] = number
-    state = _state(partitions, np.asarray(subgoal_of, dtype=np.int64)[known][first])
-    _draw_partitions(_model(mixture), state, np.flatnonzero(~known), generator)
-    return state
-
-
-def assignments(
-    state: PartitionState,
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Partition, in any numbers, and subgoal of each observation (N,), as `seat` takes them."""
-    partition_of = state.partition_of.astype(np.int64)
-    return partition_of, state.subgoal_of_slot[partition_of].astype(np.int64)
+    now = _state(partitions, subgoals[first])
+    _draw_partitions(_model(mixture), now, np.flatnonzero(partitions < 0), generator)
+    return now
 
 
 def advance(
@@ -174,7 +179,7 @@ def _draw_subgoals(model, state, generator):  # type: ignore[no-untyped-def]
     scores = _subgoal_scores(model, state)
     for position in range(state.occupied[0]):
         weights = np.exp(scores[position] - scores[position].max())
-        subgoal = _categorical(weights, weights.sum(), generator)
+        subgoal = categorical(weights, weights.sum(), generator)
         state.subgoal_of_slot[state.slots[position]] = subgoal
 
 
@@ -225,10 +230,10 @@ def _draw_partitions(model, state, chosen, generator):  # type: ignore[no-untype
             total += weight
         weights[count] = model.new_partition_weight[model.pair_of[i]]
         total += weights[count]
-        position = _categorical(weights[: count + 1], total, generator)
+        position = categorical(weights[: count + 1], total, generator)
         if position == count:
             likely = model.prior * likelihood
-            subgoal = _categorical(likely, likely.sum(), generator)
+            subgoal = categorical(likely, likely.sum(), generator)
             state.subgoal_of_slot[state.slots[count]] = subgoal
         _put_in(state, i, position)
 
@@ -264,20 +269,6 @@ def _redraw_partitions(model, state, generator):  # type: ignore[no-untyped-def]
             state.subgoal_of_slot[slot] = subgoal
         seated[subgoal] += 1
         _put_in(state, i, state.position_of_slot[slot])
-
-
-@njit(nogil=True, cache=True)
-def _categorical(weights, total, generator):  # type: ignore[no-untyped-def]
-    """Index drawn with probability weights / total; never one of weight zero."""
-    remaining = generator.random() * total
-    last = 0
-    for index in range(weights.shape[0]):
-        if weights[index] > 0.0:
-            last = index
-            remaining -= weights[index]
-            if remaining < 0.0:
-                break
-    return last
 
 
 @njit(nogil=True, cache=True)

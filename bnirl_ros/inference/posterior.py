@@ -10,15 +10,19 @@ import numpy.typing as npt
 
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.errors import InputError
+from bnirl_ros.inference import mode, pursuit_mode
 from bnirl_ros.inference.chains import Progress, run_chains
 from bnirl_ros.inference.diagnostics import effective_sample_size, rhat
 from bnirl_ros.inference.draws import Draws
-from bnirl_ros.inference.mode import Mode, posterior_mode
+from bnirl_ros.inference.mode import Mode
+from bnirl_ros.inference.runs import run_counts
+from bnirl_ros.inference.samplers import Model
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.maps.grid_map import GridMap
 from bnirl_ros.mdp.grid_world import GridWorld
 from bnirl_ros.model.candidates import candidate_cells
 from bnirl_ros.model.mixture import SubgoalMixture, subgoal_mixture
+from bnirl_ros.model.pursuits import pursuit_model
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,33 +34,47 @@ class Posterior:
         demonstration: the N observations.
         draws: draws (chain, draw, N).
         mode: the most probable partition with its subgoals.
-        rhat, ess: the worse one for log joint and number of partitions, both free of labels; None
-            where undefined (`bnirl_ros.inference.diagnostics`).
+        settings: with which they were drawn.
+        rhat, ess: the worst one for log joint, number of partitions and inferred parameters, all
+            free of labels; None where undefined (`bnirl_ros.inference.diagnostics`).
     """
 
     candidates: npt.NDArray[np.int64]
     demonstration: Demonstration
     draws: Draws
     mode: Mode
+    settings: Settings
     rhat: float | None
     ess: float | None
 
+    def pursuit_counts(
+        self, region_of: npt.NDArray[np.int32] | None = None
+    ) -> npt.NDArray[np.int64]:
+        """(D, G) number of pursuits of each candidate in each draw of all chains.
+
+        Args:
+            region_of: (G,) candidate that stands for each one; by default each for itself.
+        """
+        drawn = self.draws.subgoal_of.reshape(-1, len(self.demonstration))
+        if region_of is not None:
+            drawn = np.append(region_of, np.int32(-1))[drawn]
+        return np.asarray(run_counts(drawn, self.demonstration.starts, len(self.candidates)))
+
     def subgoal_probability(self) -> npt.NDArray[np.float64]:
         """(G,) share of the draws in which each candidate is some observation's subgoal."""
-        drawn = self.draws.subgoal_of.reshape(-1, len(self.demonstration))
-        occurs = np.zeros((len(drawn), len(self.candidates)), dtype=np.bool_)
-        for present, subgoals in zip(occurs, drawn, strict=True):
-            present[subgoals] = True
-        return occurs.mean(axis=0)
+        return np.asarray((self.pursuit_counts() > 0).mean(axis=0))
 
     def assignment_probability(self) -> npt.NDArray[np.float64]:
-        """(N, G) share of the draws in which each candidate is the observation's subgoal."""
+        """(N, G) share of the draws in which each candidate is the observation's subgoal.
+
+        What is missing to one is the probability that the observation is a slip.
+        """
         drawn = self.draws.subgoal_of.reshape(-1, len(self.demonstration))
-        counts = np.zeros((len(self.demonstration), len(self.candidates)))
+        counts = np.zeros((len(self.demonstration), len(self.candidates) + 1))
         rows = np.arange(len(counts))
         for subgoals in drawn:
             counts[rows, subgoals] += 1.0
-        return counts / len(drawn)
+        return counts[:, :-1] / len(drawn)
 
 
 def grid_world(grid_map: GridMap, settings: Settings) -> GridWorld:
@@ -64,37 +82,52 @@ def grid_world(grid_map: GridMap, settings: Settings) -> GridWorld:
     return GridWorld(grid_map.free, settings.moves, settings.success, settings.discount)
 
 
-def paper_model(
+def model_of(
     demonstration: Demonstration, grid_map: GridMap, settings: Settings
-) -> tuple[npt.NDArray[np.int64], SubgoalMixture]:
-    """Candidate cells (G, 2) and the paper's mixture over them."""
+) -> tuple[npt.NDArray[np.int64], Model]:
+    """Candidate cells (G, 2) and the model over them that the settings ask for."""
     world = grid_world(grid_map, settings)
     candidates = candidate_cells(settings.candidates, demonstration, world)
-    return candidates, subgoal_mixture(
+    states, goals = world.states_of(demonstration.cells), world.states_of(candidates)
+    if settings.model == "paper":
+        return candidates, subgoal_mixture(
+            world, states, demonstration.action, goals, **settings.fixed
+        )
+    visited = world.cells_of(np.unique(states))
+    apart = np.linalg.norm(visited[:, None] - candidates, axis=2) * grid_map.resolution
+    return candidates, pursuit_model(
         world,
-        world.states_of(demonstration.cells),
+        states,
         demonstration.action,
-        world.states_of(candidates),
-        settings.alpha,
-        settings.eta,
+        demonstration.starts,
+        goals,
+        arrived=apart <= settings.arrival_radius,
+        likelihood=settings.likelihood,
+        fixed=settings.fixed,
     )
 
 
 def posterior_of(
     candidates: npt.NDArray[np.int64],
     demonstration: Demonstration,
-    mixture: SubgoalMixture,
+    model: Model,
     draws: Draws,
+    settings: Settings,
 ) -> Posterior:
-    """The posterior that draws (chain, draw, N) of a mixture stand for."""
-    traces = (draws.log_joint, draws.partition_count)
+    """The posterior that draws (chain, draw, N) of a model stand for."""
+    traces = (draws.log_joint, draws.partition_count, *np.moveaxis(draws.parameters, -1, 0))
     rhats = [value for value in map(rhat, traces) if value is not None]
     sizes = [value for value in map(effective_sample_size, traces) if value is not None]
     return Posterior(
         candidates=candidates,
         demonstration=demonstration,
         draws=draws,
-        mode=posterior_mode(mixture, draws),
+        mode=(
+            mode.posterior_mode(model, draws)
+            if isinstance(model, SubgoalMixture)
+            else pursuit_mode.posterior_mode(model, draws)
+        ),
+        settings=settings,
         rhat=max(rhats, default=None),
         ess=min(sizes, default=None),
     )
@@ -125,6 +158,6 @@ def infer(
     """
     if len(demonstration) == 0:
         raise InputError("there is no observation to infer from; a pose and an action make one")
-    candidates, mixture = paper_model(demonstration, grid_map, settings)
-    draws = run_chains(mixture, settings, progress, stop)
-    return posterior_of(candidates, demonstration, mixture, draws)
+    candidates, model = model_of(demonstration, grid_map, settings)
+    draws = run_chains(model, settings, progress, stop)
+    return posterior_of(candidates, demonstration, model, draws, settings)

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from bnirl_ros.demonstrations.placement import Placement
-from bnirl_ros.inference import partition_gibbs as sampler
 from bnirl_ros.inference.draws import Draws
-from bnirl_ros.inference.posterior import Posterior, paper_model, posterior_of
+from bnirl_ros.inference.posterior import Posterior, model_of, posterior_of
+from bnirl_ros.inference.samplers import sampler_of
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.maps.grid_map import GridMap
 
@@ -42,20 +43,21 @@ class RunningPosterior:
         """Chains over a demonstration with at least one observation.
 
         Where there is a posterior from `before`, of other observations, another map or other
-        settings, its chains go on: what was observed then keeps its partition and subgoal, as far
-        as the subgoal is still a candidate, and new observations are seated by (14). With another
-        seed, or another number of chains, they start anew.
+        settings, its chains go on: what was observed then keeps its subgoal, as far as that is
+        still a candidate. With another model, another seed, or another number of chains, they
+        start anew.
         """
         self.placement, self.grid_map, self.settings = placement, grid_map, settings
         self.sweeps = 0
-        self._candidates, self._mixture = paper_model(placement.demonstration, grid_map, settings)
-        self._draws = Draws.empty((settings.chains, CAPACITY), len(placement.poses))
+        self._candidates, self._model = model_of(placement.demonstration, grid_map, settings)
+        self._sampler = sampler_of(self._model)
+        self._draws = self._sampler.room_for(self._model, (settings.chains, CAPACITY))
         self._kept, self._thin = 0, 1
         self._generators: list[np.random.Generator]
-        self._states: list[sampler.PartitionState]
-        if before and (settings.chains, settings.seed) == (
-            before.settings.chains,
-            before.settings.seed,
+        self._states: list[Any]
+        if before and all(
+            getattr(settings, name) == getattr(before.settings, name)
+            for name in ("chains", "seed", "model")
         ):
             self._generators = before._generators
             self._states = self._states_going_on(before)
@@ -63,7 +65,8 @@ class RunningPosterior:
             seeds = np.random.SeedSequence(settings.seed).spawn(settings.chains)
             self._generators = [np.random.default_rng(seed) for seed in seeds]
             self._states = [
-                sampler.initial_state(self._mixture, generator) for generator in self._generators
+                self._sampler.initial_state(self._model, generator)
+                for generator in self._generators
             ]
 
     @property
@@ -83,7 +86,7 @@ class RunningPosterior:
         def run_chain(chain: int) -> None:
             part = self._draws[chain][self._kept : end]
             state, generator = self._states[chain], self._generators[chain]
-            sampler.advance(self._mixture, state, generator, part, self._thin)
+            self._sampler.advance(self._model, state, generator, part, self._thin)
 
         with ThreadPoolExecutor(min(len(self._states), os.cpu_count() or 1)) as threads:
             list(threads.map(run_chain, range(len(self._states))))
@@ -94,24 +97,22 @@ class RunningPosterior:
         """The posterior from all draws but the first quarter, in which the chains settle."""
         kept = slice(self._kept // 4, self._kept)
         draws = Draws(*(values[:, kept] for values in vars(self._draws).values()))
-        return posterior_of(self._candidates, self.placement.demonstration, self._mixture, draws)
+        return posterior_of(
+            self._candidates, self.placement.demonstration, self._model, draws, self.settings
+        )
 
-    def _states_going_on(self, before: RunningPosterior) -> list[sampler.PartitionState]:
+    def _states_going_on(self, before: RunningPosterior) -> list[Any]:
         """The states of the chains before, over the present observations and candidates."""
         _, old, new = np.intersect1d(
             before.placement.poses, self.placement.poses, return_indices=True
         )
-        candidate_of_old = self._candidates_on(before)
-        states = []
-        for state, generator in zip(before._states, self._generators, strict=True):
-            partitions, subgoals = sampler.assignments(state)
-            subgoals_now = candidate_of_old[subgoals[old]]
-            partition_of = np.full(len(self.placement.poses), -1, dtype=np.int64)
-            subgoal_of = partition_of.copy()
-            partition_of[new] = np.where(subgoals_now >= 0, partitions[old], -1)
-            subgoal_of[new] = subgoals_now
-            states.append(sampler.seat(self._mixture, partition_of, subgoal_of, generator))
-        return states
+        row_before = np.full(len(self.placement.poses), -1, dtype=np.int64)
+        row_before[new] = old
+        candidate_now = self._candidates_on(before)
+        return [
+            self._sampler.going_on(self._model, state, row_before, candidate_now, generator)
+            for state, generator in zip(before._states, self._generators, strict=True)
+        ]
 
     def _candidates_on(self, before: RunningPosterior) -> npt.NDArray[np.int64]:
         """(G before,) present index of each candidate before, by its place; -1 for none."""

@@ -9,6 +9,8 @@ from typing import Any
 
 from bnirl_ros.errors import InputError
 from bnirl_ros.model.candidates import CANDIDATE_KINDS
+from bnirl_ros.model.likelihood import LIKELIHOODS
+from bnirl_ros.model.pursuits import PRIORS
 
 
 @dataclass(frozen=True)
@@ -56,14 +58,31 @@ class Limits:
         return " and ".join(words.format(bound) for bound, words in bounds if abs(bound) < 1e300)
 
 
+PAPER_PARAMETERS = {"alpha": 50.0, "eta": 1.0}
+"""What the paper's model takes where nothing is given: it infers neither."""
+
+
 def _setting(default: Any, description: str, **limits: Any) -> Any:
     return field(default=default, metadata={"limits": Limits(description, **limits)})
+
+
+def _parameter(name: str, description: str, **limits: Any) -> Any:
+    """A parameter of the model, which is inferred where it is not given."""
+    words = f"{description}; inferred where not given, prior {PRIORS[name]}"
+    if name in PAPER_PARAMETERS:
+        words += f"; {PAPER_PARAMETERS[name]:g} for the paper's model"
+    return field(default=None, metadata={"limits": Limits(words, **limits)})
 
 
 def limits_of(setting: Field[Any]) -> Limits:
     """The limits that a field of `Settings` was declared with."""
     limits: Limits = setting.metadata["limits"]
     return limits
+
+
+def kind_of(setting: Field[Any]) -> type:
+    """Type of a setting's values; a parameter that may be inferred is a float."""
+    return float if setting.default is None else type(setting.default)
 
 
 @dataclass(frozen=True)
@@ -75,13 +94,39 @@ class Settings:
     """
 
     model: str = _setting(
-        "paper", "model of the demonstrator: the mixture of Michini & How", choices=("paper",)
+        "sequential",
+        "model of the demonstrator: pursuits in sequence, or the mixture of Michini & How",
+        choices=("sequential", "paper"),
     )
-    alpha: float = _setting(
-        50.0, "confidence alpha in the demonstrator's choices, equation (7)", above=0.0
+    alpha: float | None = _parameter(
+        "alpha", "confidence [nats for each step lost], or alpha of equation (7)", above=0.0
     )
-    eta: float = _setting(
-        1.0, "concentration eta of the Chinese restaurant process, equation (5)", above=0.0
+    eta: float | None = _parameter("eta", "concentration of the subgoals' weights", above=0.0)
+    slip: float | None = _parameter(
+        "slip", "probability of an action that no subgoal explains", lowest=0.0, below=1.0
+    )
+    switch_on_arrival: float | None = _parameter(
+        "switch_on_arrival", "probability of the next subgoal on arriving", lowest=0.0, highest=1.0
+    )
+    switch_at_subgoal: float | None = _parameter(
+        "switch_at_subgoal",
+        "probability of the next subgoal in each further observation there",
+        lowest=0.0,
+        highest=1.0,
+    )
+    switch_elsewhere: float | None = _parameter(
+        "switch_elsewhere",
+        "probability of another subgoal in each observation on the way",
+        lowest=0.0,
+        highest=1.0,
+    )
+    arrival_radius: float = _setting(
+        0.0, "distance within which a subgoal is reached [m]; 0: in its cell", lowest=0.0
+    )
+    likelihood: str = _setting(
+        "delay",
+        "what actions of the sequential model cost: steps, or value as in equation (7)",
+        choices=LIKELIHOODS,
     )
     sweeps: int = _setting(1000, "sweeps of each chain, burn-in included", lowest=1)
     burn_in: int = _setting(200, "first sweeps of each chain that are left out", lowest=0)
@@ -106,7 +151,9 @@ class Settings:
 
     def __post_init__(self) -> None:
         for setting in fields(self):
-            value, kind = getattr(self, setting.name), type(setting.default)
+            value, kind = getattr(self, setting.name), kind_of(setting)
+            if value is None and setting.default is None:
+                continue
             if kind is float and type(value) is int:
                 object.__setattr__(self, setting.name, float(value))
             elif type(value) is not kind:
@@ -119,6 +166,17 @@ class Settings:
                 f"sweeps must leave a draw: {self.sweeps} sweeps less {self.burn_in} of burn-in "
                 f"hold none at thin {self.thin}"
             )
+
+    @property
+    def fixed(self) -> dict[str, float]:
+        """The parameters of the model that are not inferred, by name."""
+        given = {name: getattr(self, name) for name in PRIORS}
+        if self.model == "paper":
+            given = {
+                name: default if given[name] is None else given[name]
+                for name, default in PAPER_PARAMETERS.items()
+            }
+        return {name: value for name, value in given.items() if value is not None}
 
     @property
     def draws(self) -> int:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 import numpy.typing as npt
 
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.inference.posterior import Posterior
+from bnirl_ros.inference.runs import runs
 from bnirl_ros.maps.grid_map import GridMap
+from bnirl_ros.model.pursuits import PRIORS
 
 
 @dataclass(frozen=True)
@@ -45,8 +49,8 @@ class Pursuit:
         rank: of the subgoal.
         first, last: the first and the last observation that the subgoal explains, by their rows
             in `Summary.observations`.
-        arrived: whether the demonstrator was at the subgoal, after `first` was observed and by
-            the pose that follows `last`.
+        arrived: whether the demonstrator was at the subgoal between `first` and the beginning of
+            the next pursuit, or the last pose of the episode.
     """
 
     episode: int
@@ -112,24 +116,44 @@ class Summary:
 
 
 def summarise(posterior: Posterior, grid_map: GridMap) -> Summary:
-    """What a posterior says: the subgoals of its mode, ranked, placed and in order of visit."""
-    demonstration, mode = posterior.demonstration, posterior.mode
-    probability = posterior.subgoal_probability()
-    candidates, index, counts = np.unique(mode.subgoal_of, return_inverse=True, return_counts=True)
-    by_rank = np.argsort(-counts, kind="stable")  # equal counts: by row and column of the cell
-    rank_of = (np.argsort(by_rank) + 1)[index]
-    cells = posterior.candidates[candidates[by_rank]]
-    visits = episode_visits(demonstration, cells, rank_of)
-    height_width = grid_map.free.shape
-    cell_probability = np.zeros(height_width)
-    cell_probability[posterior.candidates[:, 1], posterior.candidates[:, 0]] = probability
+    """What a posterior says: the subgoals of its mode, ranked, placed and in order of visit.
+
+    For the sequential model, subgoals within the arrival radius of one with more pursuits count as
+    that one.
+    """
+    demonstration, settings = posterior.demonstration, posterior.settings
+    in_sequence = settings.model == "sequential"
+    counts = posterior.pursuit_counts()
+    cell_probability = np.zeros(grid_map.free.shape)
+    x, y = posterior.candidates.T
+    cell_probability[y, x] = (counts > 0).mean(axis=0)
+
+    subgoal_of = posterior.mode.subgoal_of
+    if in_sequence and settings.arrival_radius > 0.0:
+        region_of = _regions(posterior, counts, settings.arrival_radius / grid_map.resolution)
+        counts = posterior.pursuit_counts(region_of)
+        subgoal_of = np.append(region_of, np.int32(-1))[subgoal_of]
+    explained = subgoal_of >= 0
+    candidates, index, observations = np.unique(
+        subgoal_of[explained], return_inverse=True, return_counts=True
+    )
+    pursuits = counts.mean(axis=0)[candidates]
+    # Equal ones by row and column of the cell.
+    by_rank = np.argsort(-pursuits if in_sequence else -observations, kind="stable")
+    rank_of = np.zeros(len(demonstration), dtype=np.int64)
+    rank_of[explained] = (np.argsort(by_rank) + 1)[index]
+    ranked = candidates[by_rank]
+    cells = posterior.candidates[ranked]
+    sequence = _pursuits(demonstration, rank_of, _at_subgoal(posterior, grid_map, cells))
+    visits = _visits(sequence) if in_sequence else episode_visits(demonstration, cells, rank_of)
+    probability = (counts > 0).mean(axis=0)
     subgoals = tuple(
         Subgoal(
             rank=rank,
             cell=(int(cell[0]), int(cell[1])),
             position=(float(position[0]), float(position[1])),
-            probability=float(probability[candidates[by_rank[rank - 1]]]),
-            observations=int(counts[by_rank[rank - 1]]),
+            probability=float(probability[candidate]),
+            observations=int(observations[by_rank[rank - 1]]),
             visit_order=next(
                 (
                     tuple(place + 1 for place, visit in enumerate(episode) if visit == rank)
@@ -138,9 +162,10 @@ def summarise(posterior: Posterior, grid_map: GridMap) -> Summary:
                 ),
                 (),
             ),
+            pursuits=float(pursuits[by_rank[rank - 1]]) if in_sequence else None,
         )
-        for rank, (cell, position) in enumerate(
-            zip(cells, grid_map.centres_of(cells), strict=True), start=1
+        for rank, (candidate, cell, position) in enumerate(
+            zip(ranked, cells, grid_map.centres_of(cells), strict=True), start=1
         )
     )
     return Summary(
@@ -153,6 +178,115 @@ def summarise(posterior: Posterior, grid_map: GridMap) -> Summary:
         ess=posterior.ess,
         chains=len(posterior.draws),
         draws=posterior.draws.log_joint.shape[1],
+        pursuits=tuple(sequence) if in_sequence else (),
+        repetitions=_repetitions(visits) if in_sequence else 0,
+        unexplained=float((posterior.draws.subgoal_of < 0).mean()),
+        parameters=_parameters(posterior) if in_sequence else (),
+    )
+
+
+def _regions(
+    posterior: Posterior, counts: npt.NDArray[np.int64], radius: float
+) -> npt.NDArray[np.int32]:
+    """(G,) for each candidate the one that stands for it: the first within the radius [cells].
+
+    Those of the mode stand for others, the one with most pursuits first.
+    """
+    region_of = np.arange(len(posterior.candidates), dtype=np.int32)
+    found = posterior.mode.subgoal_of[posterior.mode.subgoal_of >= 0]
+    taken = np.zeros(len(region_of), dtype=np.bool_)
+    for candidate in sorted(set(found.tolist()), key=lambda g: (-counts[:, g].sum(), g)):
+        if not taken[candidate]:
+            apart = np.linalg.norm(posterior.candidates - posterior.candidates[candidate], axis=1)
+            region = (apart <= radius) & ~taken
+            region_of[region] = candidate
+            taken |= region
+    return region_of
+
+
+def _at_subgoal(
+    posterior: Posterior, grid_map: GridMap, cells: npt.NDArray[np.int64]
+) -> npt.NDArray[np.bool_]:
+    """(N + L, J) whether each observation, then each last pose, is at each subgoal's cell."""
+    demonstration = posterior.demonstration
+    places = np.concatenate([demonstration.cells, demonstration.last_cells])
+    apart = np.linalg.norm(places[:, None] - cells, axis=2) * grid_map.resolution
+    return np.asarray(apart <= posterior.settings.arrival_radius)
+
+
+def _pursuits(
+    demonstration: Demonstration,
+    rank_of: npt.NDArray[np.int64],
+    at_subgoal: npt.NDArray[np.bool_],
+) -> list[Pursuit]:
+    """The pursuits that ranks (N,), 0 for unexplained, are made of."""
+    firsts, lasts = runs(rank_of - 1, demonstration.starts)
+    last_pose = {
+        int(episode): len(demonstration) + index
+        for index, episode in enumerate(demonstration.last_episode)
+    }
+    pursuits = []
+    for number, (first, last) in enumerate(zip(firsts.tolist(), lasts.tolist(), strict=True)):
+        episode, rank = int(demonstration.episode[first]), int(rank_of[first])
+        following = firsts[number + 1] if number + 1 < len(firsts) else len(demonstration)
+        end = int(np.searchsorted(demonstration.episode, episode, side="right"))
+        places = list(range(first, min(following + 1, end)))
+        if following >= end and episode in last_pose:
+            places.append(last_pose[episode])
+        arrived = bool(at_subgoal[places, rank - 1].any())
+        pursuits.append(Pursuit(episode, rank, first, last, arrived))
+    return pursuits
+
+
+def _visits(pursuits: Sequence[Pursuit]) -> list[list[int]]:
+    """Ranks that each episode visits, in order, without repetitions in a row.
+
+    Pursuits that arrived; where a subgoal was never reached in an episode, its last pursuit there.
+    """
+    visits = []
+    for _, group in groupby(pursuits, key=lambda pursuit: pursuit.episode):
+        episode = list(group)
+        reached = {pursuit.rank for pursuit in episode if pursuit.arrived}
+        last = {pursuit.rank: pursuit for pursuit in episode}
+        ranks = [
+            pursuit.rank
+            for pursuit in episode
+            if pursuit.arrived or (pursuit.rank not in reached and last[pursuit.rank] is pursuit)
+        ]
+        visits.append([rank for rank, _ in groupby(ranks)])
+    return visits
+
+
+def _repetitions(visits: Sequence[Sequence[int]]) -> int:
+    """How often the visits go round one loop; 0 where they don't, or only once.
+
+    Every episode begins the loop anew; its last time round may break off.
+    """
+    longest = max(visits, key=len, default=())
+    for period in range(1, len(longest)):
+        loop = longest[:period]
+        if len(set(loop)) == period and all(
+            rank == loop[place % period]
+            for episode in visits
+            for place, rank in enumerate(episode)
+        ):
+            break
+    else:
+        loop = longest
+        if len(set(loop)) < len(loop) or any(list(loop[: len(e)]) != list(e) for e in visits):
+            return 0
+    rounds = sum(len(episode) // max(len(loop), 1) for episode in visits)
+    return rounds if rounds > 1 else 0
+
+
+def _parameters(posterior: Posterior) -> tuple[Parameter, ...]:
+    """Median and central 90 % interval of each parameter of the sequential model."""
+    drawn = posterior.draws.parameters.reshape(-1, len(PRIORS))
+    low, median, high = np.quantile(drawn, (0.05, 0.5, 0.95), axis=0).tolist()
+    return tuple(
+        Parameter(name, median[column], (low[column], high[column]), name not in fixed)
+        for fixed in (posterior.settings.fixed,)
+        for column, name in enumerate(PRIORS)
     )
 
 

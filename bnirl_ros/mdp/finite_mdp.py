@@ -78,6 +78,21 @@ class FiniteMDP:
         """Number of states S."""
         return (len(self.row_starts) - 1) // self.action_count
 
+    def same_action(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """(U, A) the first action with the same outcomes and probabilities."""
+        same = np.empty((len(states), self.action_count), dtype=np.int64)
+        for index, state in enumerate(states):
+            first: dict[bytes, int] = {}
+            for action in self.actions:
+                row = slice(*self.row_starts[action * self.state_count + state :][:2])
+                outcome = self.successors[row].tobytes() + self.probabilities[row].tobytes()
+                same[index, action] = first.setdefault(outcome, int(action))
+        return same
+
+    def parts_of(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """(U,) number of the part in which each state lies: transitions tie all into one."""
+        return np.zeros(len(states), dtype=np.int64)
+
     def goal_values_of(
         self,
         goals: npt.NDArray[np.int64],

@@ -16,7 +16,11 @@ _GOALS_AT_ONCE = 16  # lanes: enough to fill the vector units, few enough to sta
 
 
 class MarkovDecisionProcess(Protocol):
-    """What the method needs of an MDP without reward: a discount, and the values of goals."""
+    """What the method needs of an MDP without reward.
+
+    That is a discount, the values of goals, which actions do the same, and which states lie in
+    parts between which there is no way.
+    """
 
     @property
     def discount(self) -> float: ...
@@ -30,6 +34,10 @@ class MarkovDecisionProcess(Protocol):
     def goal_values_of(
         self, goals: npt.NDArray[np.int64], states: npt.NDArray[np.int64], tolerance: float
     ) -> npt.NDArray[np.float64]: ...
+
+    def same_action(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]: ...
+
+    def parts_of(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]: ...
 
 
 def goal_values(

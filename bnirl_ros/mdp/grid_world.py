@@ -89,6 +89,25 @@ class GridWorld:
         steps = STEPS[self.actions]
         return steps[:, 1] * self.free.shape[1] + steps[:, 0]
 
+    def same_action(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """(U, A) position of the first action that does the same: a blocked move stays.
+
+        Staying is the first action of every set.
+        """
+        bits = self.open_moves.reshape(-1)[states]
+        positions = np.arange(len(self.offsets))
+        return np.where((bits[:, None] >> positions) & 1, positions, 0)
+
+    def parts_of(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """(U,) number of the connected part of the free space in which each state lies.
+
+        A diagonal move needs both cells beside it, so the parts are those of moves to the sides.
+        """
+        from scipy.ndimage import label  # here, since only this needs it
+
+        parts, _ = label(self.free)
+        return np.asarray(parts.reshape(-1)[states], dtype=np.int64)
+
     def outcomes(self) -> npt.NDArray[np.int64]:
         """(S, A) state to which each action leads from each state when it succeeds."""
         states = np.arange(self.state_count)[:, None]

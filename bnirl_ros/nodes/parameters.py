@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import Field, dataclass, fields, replace
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -22,6 +22,9 @@ from rclpy.parameter import Parameter
 
 from bnirl_ros.errors import InputError
 from bnirl_ros.inference.settings import Limits, Settings, limits_of
+
+INFERRED = -1.0
+"""Value of a parameter of the model that is not given: ROS has none for nothing."""
 
 
 @dataclass(frozen=True)
@@ -62,17 +65,23 @@ def declare_settings(node: Node, on_change: Callable[[Settings], None]) -> Setti
     Raises:
         InputError: as in `declare`.
     """
-    table = [
-        NodeParameter(field.name, field.default, limits_of(field), read_only=False)
-        for field in fields(Settings)
-    ]
+    table = [_of_setting(setting) for setting in fields(Settings)]
     names = {entry.name for entry in table}
-    settings = Settings(**declare(node, table))
+    inferable = {setting.name for setting in fields(Settings) if setting.default is None}
+
+    def settings_of(values: Mapping[str, Any]) -> Settings:
+        given: dict[str, Any] = {
+            name: None if name in inferable and value == INFERRED else value
+            for name, value in values.items()
+        }
+        return Settings(**given)
+
+    settings = settings_of(declare(node, table))
 
     def changed(parameters: Sequence[Parameter]) -> Settings:
         values = {entry.name: node.get_parameter(entry.name).value for entry in table}
         values.update({p.name: p.value for p in parameters if p.name in names})
-        return replace(settings, **values)
+        return settings_of(values)
 
     def check(parameters: Sequence[Parameter]) -> SetParametersResult:
         try:
@@ -88,6 +97,16 @@ def declare_settings(node: Node, on_change: Callable[[Settings], None]) -> Setti
     node.add_on_set_parameters_callback(check)
     node.add_post_set_parameters_callback(apply)
     return settings
+
+
+def _of_setting(setting: Field[Any]) -> NodeParameter:
+    """A parameter for a setting; one of the model that may be inferred has a value for that."""
+    limits = limits_of(setting)
+    if setting.default is not None:
+        return NodeParameter(setting.name, setting.default, limits, read_only=False)
+    described = f"{limits.description}; {INFERRED:g}: not given"
+    limits = replace(limits, description=described, lowest=INFERRED, above=-math.inf)
+    return NodeParameter(setting.name, INFERRED, limits, read_only=False)
 
 
 def _declared(node: Node, entry: NodeParameter) -> Any:

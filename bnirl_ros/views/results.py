@@ -86,8 +86,8 @@ def subgoals_document(summary: Summary, grid_map: GridMap, settings: Settings) -
         "resolution": grid_map.resolution,
         "model": {
             "name": settings.model,
-            "alpha": settings.alpha,
-            "eta": settings.eta,
+            "alpha": settings.fixed.get("alpha"),
+            "eta": settings.fixed.get("eta"),
             "discount": settings.discount,
             "success": settings.success,
         },

@@ -1,0 +1,730 @@
+"""Sampling the sequential model: pursuits in blocks, their subgoals, slips and parameters.
+
+A sweep draws, each given all else:
+
+1. the subgoals and switches of a block of observations at once: proposed by forward filtering,
+   backward sampling under the urn's predictive weights given all other pursuits, accepted by
+   Metropolis-Hastings on the urn's probability of the sequence. The weights themselves are
+   integrated out: held as a variable they would keep a candidate that is in no pursuit from ever
+   being tried. A switch depends on the old subgoal through rho alone, so that an observation costs
+   O(G), not O(G^2). Blocks differ in length from sweep to sweep;
+2. partitions, given the subgoals, by the Chinese restaurant process that the urn collapses, and
+   the subgoal of each partition anew: whole groups of pursuits move at once;
+3. which actions are slips, and the parameters: beta ones from their conditionals, log-normal ones
+   by slice sampling.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from bnirl_ros.inference.draws import Draws
+from bnirl_ros.inference.random_draws import categorical
+from bnirl_ros.model.pursuits import PRIORS, PursuitModel
+
+_SHORTEST_BLOCK, _LONGEST_BLOCK = 8, 1024  # observations; their logarithm is uniform
+_BLOCK_ENTRIES = 4_000_000  # of the forward messages: shorter blocks where candidates are many
+_SLICE = 0.7  # first width of a slice, of a logarithm
+_CONFIDENCE_PERIOD = 4  # sweeps between two draws of alpha, for which all likelihoods change
+
+# Columns of the parameters, in the order of `PRIORS`.
+ALPHA, ETA, SLIP, ON_ARRIVAL, AT_SUBGOAL, ELSEWHERE = range(len(PRIORS))
+
+
+class PursuitState(NamedTuple):
+    """State of one chain, in arrays that sampling changes.
+
+    Attributes:
+        subgoal_of: (N,) int32 candidate index theta of each observation's subgoal.
+        switched: (N,) bool whether it is a draw of its own.
+        slipped: (N,) bool whether the action is a slip.
+        partition_of: (N,) int32 partition of each observation's pursuit, numbered from 0.
+        counts: (G,) int64 draws of each candidate.
+        parameters: (6,) float64 in the order of `PRIORS`.
+        sweeps: (1,) int64 sweeps so far.
+    """
+
+    subgoal_of: npt.NDArray[np.int32]
+    switched: npt.NDArray[np.bool_]
+    slipped: npt.NDArray[np.bool_]
+    partition_of: npt.NDArray[np.int32]
+    counts: npt.NDArray[np.int64]
+    parameters: npt.NDArray[np.float64]
+    sweeps: npt.NDArray[np.int64]
+
+
+class KernelModel(NamedTuple):
+    """A `PursuitModel` as the kernels take it.
+
+    Attributes:
+        cost, state_of, starts, arrived, state_part, candidate_part, prior, uniform: as there.
+        pair_of: (N,) number k of each observation's distinct (state, action) pair.
+        pair_state, pair_action: (K,) the pairs.
+        near_first: (U + 1,) `near[near_first[u] : near_first[u + 1]]` are the candidates at which
+            state u counts as having arrived.
+        near: (M,).
+        is_fixed: (6,) bool which parameters are not inferred.
+        hyper: (6, 2) the two numbers of each parameter's prior.
+        parts: number of parts.
+    """
+
+    cost: npt.NDArray[np.float64]
+    state_of: npt.NDArray[np.int64]
+    starts: npt.NDArray[np.bool_]
+    arrived: npt.NDArray[np.bool_]
+    state_part: npt.NDArray[np.int64]
+    candidate_part: npt.NDArray[np.int64]
+    prior: npt.NDArray[np.float64]
+    uniform: npt.NDArray[np.float64]
+    pair_of: npt.NDArray[np.int64]
+    pair_state: npt.NDArray[np.int64]
+    pair_action: npt.NDArray[np.int64]
+    near_first: npt.NDArray[np.int64]
+    near: npt.NDArray[np.int64]
+    is_fixed: npt.NDArray[np.bool_]
+    hyper: npt.NDArray[np.float64]
+    parts: int
+
+
+def kernel_model(model: PursuitModel) -> KernelModel:
+    """A model in the form that the kernels of sampler, mode and filter take."""
+    actions = model.cost.shape[1]
+    pairs, pair_of = np.unique(model.state_of * actions + model.action_of, return_inverse=True)
+    return KernelModel(
+        cost=model.cost,
+        state_of=model.state_of,
+        starts=model.starts,
+        arrived=model.arrived,
+        state_part=model.state_part,
+        candidate_part=model.candidate_part,
+        prior=model.prior,
+        uniform=model.uniform,
+        pair_of=pair_of.astype(np.int64),
+        pair_state=pairs // actions,
+        pair_action=pairs % actions,
+        near_first=np.concatenate([[0], np.cumsum(model.arrived.sum(axis=1))]).astype(np.int64),
+        near=np.nonzero(model.arrived)[1].astype(np.int64),
+        is_fixed=np.array([name in model.fixed for name in PRIORS]),
+        hyper=np.array([model.priors[name][1:] for name in PRIORS], dtype=np.float64),
+        parts=int(model.candidate_part.max()) + 1,
+    )
+
+
+def room_for(model: PursuitModel, shape: tuple[int, ...]) -> Draws:
+    """Draws still to be filled: `shape` is (draws,) or (chains, draws)."""
+    return Draws.empty(shape, len(model.state_of), len(PRIORS))
+
+
+def initial_state(model: PursuitModel, generator: np.random.Generator) -> PursuitState:
+    """Parameters from their priors; every episode one pursuit, of a subgoal from P(g)."""
+    parameters = np.array(
+        [
+            model.fixed[name] if name in model.fixed else prior.draw(generator)
+            for name, prior in model.priors.items()
+        ]
+    )
+    return _extended(
+        model,
+        np.full(len(model.state_of), -1, dtype=np.int32),
+        model.starts.copy(),
+        parameters,
+        generator,
+    )
+
+
+def going_on(
+    model: PursuitModel,
+    state: PursuitState,
+    row_before: npt.NDArray[np.int64],
+    candidate_now: npt.NDArray[np.int64],
+    generator: np.random.Generator,
+) -> PursuitState:
+    """A state of a changed demonstration that goes on from an older one.
+
+    What was observed then keeps its subgoal; a new observation keeps that of the one before it.
+
+    Args:
+        model: of the observations now.
+        state: of the observations before.
+        row_before: (N,) row of each observation before; -1 for a new one.
+        candidate_now: (G before,) index of each candidate now; -1 for none.
+        generator: source of randomness.
+    """
+    known = row_before >= 0
+    subgoal_of = np.full(len(row_before), -1, dtype=np.int32)
+    subgoal_of[known] = candidate_now[state.subgoal_of[row_before[known]]]
+    switched = model.starts.copy()
+    switched[known] |= state.switched[row_before[known]]
+    parameters = np.array(
+        [
+            model.fixed.get(name, value)
+            for name, value in zip(PRIORS, state.parameters, strict=True)
+        ]
+    )
+    return _extended(model, subgoal_of, switched, parameters, generator)
+
+
+def _extended(
+    model: PursuitModel,
+    subgoal_of: npt.NDArray[np.int32],
+    switched: npt.NDArray[np.bool_],
+    parameters: npt.NDArray[np.float64],
+    generator: np.random.Generator,
+) -> PursuitState:
+    """A state with a subgoal wherever there was none (-1), and the switches that this takes."""
+    for t in range(len(subgoal_of)):
+        part = model.state_part[model.state_of[t]]
+        if subgoal_of[t] >= 0 and model.candidate_part[subgoal_of[t]] != part:
+            subgoal_of[t] = -1  # the map has changed
+        if subgoal_of[t] < 0 and not model.starts[t]:
+            subgoal_of[t] = subgoal_of[t - 1]
+        elif subgoal_of[t] < 0:
+            subgoal_of[t] = generator.choice(np.flatnonzero(model.candidate_part == part))
+    changes = np.diff(subgoal_of, prepend=np.int32(-1)) != 0
+    switched = switched | changes
+    # A switch cannot have happened, or not happened, where its probability says so.
+    rho = model.switch_probability(parameters)[np.arange(len(subgoal_of)), np.roll(subgoal_of, 1)]
+    switched |= rho == 1.0
+    return PursuitState(
+        subgoal_of=subgoal_of,
+        switched=switched,
+        slipped=np.zeros(len(subgoal_of), dtype=np.bool_),
+        partition_of=np.zeros(len(subgoal_of), dtype=np.int32),
+        counts=np.bincount(subgoal_of[switched], minlength=len(model.prior)).astype(np.int64),
+        parameters=parameters,
+        sweeps=np.zeros(1, dtype=np.int64),
+    )
+
+
+def advance(
+    model: PursuitModel,
+    state: PursuitState,
+    generator: np.random.Generator,
+    draws: Draws,
+    thin: int = 1,
+) -> None:
+    """Sweep on from `state`, changing it, until all of `draws` is filled.
+
+    Every `thin`-th sweep is recorded; a slip has subgoal and partition -1. Releases the GIL; equal
+    generators give equal draws.
+    """
+    arrays = (draws.subgoal_of, draws.partition_of, draws.log_joint, draws.parameters)
+    _advance(kernel_model(model), state, generator, thin, *arrays)
+
+
+@njit(nogil=True, cache=True)
+def _advance(model, state, generator, thin, subgoal_of, partition_of, log_joint, parameters):  # type: ignore[no-untyped-def]
+    candidates = model.prior.shape[0]
+    longest = max(_SHORTEST_BLOCK, min(_LONGEST_BLOCK, _BLOCK_ENTRIES // candidates))
+    forward = np.empty((longest, candidates))
+    chosen = softmax_table(model, state.parameters[ALPHA])
+    label = np.empty(state.subgoal_of.shape[0], dtype=np.int32)
+    for draw in range(log_joint.shape[0]):
+        for _ in range(thin):
+            _draw_blocks(model, state, chosen, forward, generator)
+            _draw_groups(model, state, chosen, generator)
+            _draw_slips(model, state, chosen, generator)
+            _draw_probabilities(model, state, generator)
+            if not model.is_fixed[ETA]:
+                _draw_concentration(model, state, generator)
+            if state.sweeps[0] % _CONFIDENCE_PERIOD == 0 and not model.is_fixed[ALPHA]:
+                _draw_confidence(model, state, generator)
+                chosen = softmax_table(model, state.parameters[ALPHA])
+            state.sweeps[0] += 1
+        log_joint[draw] = log_joint_of(model, state, chosen)
+        parameters[draw] = state.parameters
+        label[:] = -1
+        labels = 0
+        for t in range(label.shape[0]):
+            if state.slipped[t]:
+                subgoal_of[draw, t] = -1
+                partition_of[draw, t] = -1
+                continue
+            partition = state.partition_of[t]
+            if label[partition] < 0:
+                label[partition] = labels
+                labels += 1
+            partition_of[draw, t] = label[partition]
+            subgoal_of[draw, t] = state.subgoal_of[t]
+
+
+@njit(nogil=True, cache=True)
+def softmax_table(model, alpha):  # type: ignore[no-untyped-def]
+    """(K, G) probability of each pair's action by the softmax, slips left out."""
+    actions, candidates = model.cost.shape[1:]
+    table = np.empty((model.pair_state.shape[0], candidates))
+    total = np.empty(candidates)
+    before = -1
+    for pair in range(table.shape[0]):
+        state = model.pair_state[pair]
+        if state != before:
+            total[:] = 0.0
+            for action in range(actions):
+                total += np.exp(-alpha * model.cost[state, action])
+            before = state
+        cost = model.cost[state, model.pair_action[pair]]
+        # What cannot be is only very improbable, so that a filter always has something left.
+        table[pair] = np.maximum(np.exp(-alpha * cost) / total, 1e-200)
+    return table
+
+
+@njit(nogil=True, cache=True)
+def likelihood(model, parameters, chosen, t, candidate):  # type: ignore[no-untyped-def]
+    """P(a_t | s_t, g), slips included."""
+    slip = parameters[SLIP]
+    uniform = model.uniform[model.state_of[t]]
+    return (1.0 - slip) * chosen[model.pair_of[t], candidate] + slip * uniform
+
+
+@njit(nogil=True, cache=True)
+def switch_probability(model, parameters, t, candidate):  # type: ignore[no-untyped-def]
+    """Rho before observation t, which begins no episode, where `candidate` was pursued."""
+    if not model.arrived[model.state_of[t], candidate]:
+        return parameters[ELSEWHERE]
+    if model.arrived[model.state_of[t - 1], candidate]:
+        return parameters[AT_SUBGOAL]
+    return parameters[ON_ARRIVAL]
+
+
+@njit(nogil=True, cache=True)
+def urn_weights(model, eta, counts, part):  # type: ignore[no-untyped-def]
+    """(G,) probability that the next draw in a part of the map is each candidate."""
+    drawn = 0
+    for candidate in range(counts.shape[0]):
+        if model.candidate_part[candidate] == part:
+            drawn += counts[candidate]
+    weights = np.zeros(counts.shape[0])
+    for candidate in range(counts.shape[0]):
+        if model.candidate_part[candidate] == part:
+            weights[candidate] = eta * model.prior[candidate] + counts[candidate]
+    return weights / (eta + drawn)
+
+
+@njit(nogil=True, cache=True)
+def forward_pass(model, parameters, chosen, weights, first, end, before, forward, evidence):  # type: ignore[no-untyped-def]
+    """Filter observations `first` to `end` of one episode.
+
+    Fills forward[i] (G,) with P(theta_t | actions up to t), t = first + i, and evidence[i] with
+    the probability of action t given those before it. `before` (G,) is the same for first - 1; it
+    is not read where `first` begins the episode.
+    """
+    state_of, pair_of, uniform = model.state_of, model.pair_of, model.uniform
+    arrived, near_first, near = model.arrived, model.near_first, model.near
+    candidates = weights.shape[0]
+    on_arrival, at_subgoal = parameters[ON_ARRIVAL], parameters[AT_SUBGOAL]
+    elsewhere = parameters[ELSEWHERE]
+    explained = 1.0 - parameters[SLIP]
+    for t in range(first, end):
+        state = state_of[t]
+        likely = chosen[pair_of[t]]
+        unexplained = parameters[SLIP] * uniform[state]
+        after = forward[t - first]
+        if model.starts[t]:
+            for candidate in range(candidates):
+                after[candidate] = weights[candidate]
+        else:
+            switch = elsewhere
+            for index in range(near_first[state], near_first[state + 1]):
+                candidate = near[index]
+                rho = at_subgoal if arrived[state_of[t - 1], candidate] else on_arrival
+                switch += before[candidate] * (rho - elsewhere)
+            for candidate in range(candidates):
+                kept = before[candidate] * (1.0 - elsewhere)
+                after[candidate] = kept + switch * weights[candidate]
+            for index in range(near_first[state], near_first[state + 1]):
+                candidate = near[index]
+                rho = at_subgoal if arrived[state_of[t - 1], candidate] else on_arrival
+                kept = before[candidate] * (1.0 - rho)
+                after[candidate] = kept + switch * weights[candidate]
+        total = 0.0
+        for candidate in range(candidates):
+            value = after[candidate] * (explained * likely[candidate] + unexplained)
+            after[candidate] = value
+            total += value
+        scale = 1.0 / total
+        for candidate in range(candidates):
+            after[candidate] *= scale
+        evidence[t - first] = total
+        before = after
+
+
+@njit(nogil=True, cache=True)
+def near(model, t):  # type: ignore[no-untyped-def]
+    """Candidates at which the demonstrator counts as having arrived when it chose action t."""
+    state = model.state_of[t]
+    return model.near[model.near_first[state] : model.near_first[state + 1]]
+
+
+@njit(nogil=True, cache=True)
+def switch_mass(model, parameters, filtered, t):  # type: ignore[no-untyped-def]
+    """Probability of a switch before t, where theta_(t-1) is distributed as `filtered`."""
+    mass = parameters[ELSEWHERE]
+    for candidate in near(model, t):
+        rho = switch_probability(model, parameters, t, candidate)
+        mass += filtered[candidate] * (rho - parameters[ELSEWHERE])
+    return mass
+
+
+@njit(nogil=True, cache=True)
+def _draw_blocks(model, state, chosen, forward, generator):  # type: ignore[no-untyped-def]
+    """Step 1, block by block; the first block's end is random, so that the bounds move."""
+    span = math.log(forward.shape[0] / _SHORTEST_BLOCK)
+    length = int(_SHORTEST_BLOCK * math.exp(generator.random() * span))
+    limit = 1 + int(generator.random() * length)
+    count = model.starts.shape[0]
+    first = 0
+    while first < count:
+        end = first + 1
+        while end < count and end - first < limit and not model.starts[end]:
+            end += 1
+        _draw_block(model, state, chosen, forward, first, end, generator)
+        first, limit = end, length
+
+
+@njit(nogil=True, cache=True)
+def _draw_block(model, state, chosen, forward, first, end, generator):  # type: ignore[no-untyped-def]
+    """Observations `first` to `end` of one episode, and whether there is a switch at `end`."""
+    theta, parameters, counts = state.subgoal_of, state.parameters, state.counts
+    candidates = counts.shape[0]
+    goes_on = end < model.starts.shape[0] and not model.starts[end]
+    last = end + 1 if goes_on else end
+    for t in range(first, last):
+        if state.switched[t]:
+            counts[theta[t]] -= 1
+    part = model.state_part[model.state_of[first]]
+    weights = urn_weights(model, parameters[ETA], counts, part)
+
+    before = np.zeros(candidates)
+    if not model.starts[first]:
+        before[theta[first - 1]] = 1.0
+    evidence = np.empty(end - first)
+    forward_pass(model, parameters, chosen, weights, first, end, before, forward, evidence)
+
+    # Backwards: the subgoal of each observation and whether it was switched to.
+    new_theta = np.empty(last - first, dtype=np.int32)
+    new_switched = np.empty(last - first, dtype=np.bool_)
+    weight = np.empty(candidates)
+    if goes_on:
+        new_theta[end - first] = theta[end]
+    else:
+        new_theta[end - 1 - first] = categorical(forward[end - 1 - first], 1.0, generator)
+    for t in range(last - 1, first, -1):
+        i = t - first
+        target = new_theta[i]
+        filtered = forward[i - 1]
+        rho = switch_probability(model, parameters, t, target)
+        kept = filtered[target] * (1.0 - rho)
+        switches = switch_mass(model, parameters, filtered, t) * weights[target]
+        new_switched[i] = generator.random() * (kept + switches) >= kept
+        if new_switched[i]:
+            total = 0.0
+            for candidate in range(candidates):
+                weight[candidate] = filtered[candidate] * parameters[ELSEWHERE]
+            for candidate in near(model, t):
+                weight[candidate] = filtered[candidate] * switch_probability(
+                    model, parameters, t, candidate
+                )
+            for candidate in range(candidates):
+                total += weight[candidate]
+            new_theta[i - 1] = categorical(weight, total, generator)
+        else:
+            new_theta[i - 1] = target
+    new_switched[0] = True
+    if not model.starts[first] and new_theta[0] == theta[first - 1]:
+        rho = switch_probability(model, parameters, first, new_theta[0])
+        switches = rho * weights[new_theta[0]]
+        new_switched[0] = generator.random() * (1.0 - rho + switches) >= 1.0 - rho
+
+    ratio = urn_ratio(model, parameters[ETA], counts, weights, new_theta, new_switched)
+    ratio -= urn_ratio(
+        model, parameters[ETA], counts, weights, theta[first:last], state.switched[first:last]
+    )
+    if ratio >= 0.0 or generator.random() < math.exp(ratio):
+        theta[first:last] = new_theta
+        state.switched[first:last] = new_switched
+    for t in range(first, last):
+        if state.switched[t]:
+            counts[theta[t]] += 1
+
+
+@njit(nogil=True, cache=True)
+def urn_ratio(model, eta, counts, weights, theta, switched):  # type: ignore[no-untyped-def]
+    """Log of the urn's probability of a sequence over that of independent draws from `weights`.
+
+    `counts` are those without the sequence; they are changed meanwhile.
+    """
+    part = -1
+    drawn = 0
+    ratio = 0.0
+    for i in range(theta.shape[0]):
+        if not switched[i]:
+            continue
+        candidate = theta[i]
+        if part < 0:
+            part = model.candidate_part[candidate]
+            for other in range(counts.shape[0]):
+                if model.candidate_part[other] == part:
+                    drawn += counts[other]
+        probability = (eta * model.prior[candidate] + counts[candidate]) / (eta + drawn)
+        ratio += math.log(probability / weights[candidate])
+        counts[candidate] += 1
+        drawn += 1
+    for i in range(theta.shape[0]):
+        if switched[i]:
+            counts[theta[i]] -= 1
+    return ratio
+
+
+@njit(nogil=True, cache=True)
+def _draw_groups(model, state, chosen, generator):  # type: ignore[no-untyped-def]
+    """Step 2: partitions of the draws given their subgoals, then each partition's subgoal.
+
+    P(partitions | subgoals): among the draws of g, a Chinese restaurant process with concentration
+    eta P(g). P(subgoal | partition): P(g) times the product of all that its observations say.
+    """
+    groups = _draw_partitions(model, state, generator)
+    scores = group_scores(model, state, chosen, groups)
+    subgoal = np.empty(groups, dtype=np.int32)
+    for group in range(groups):
+        weights = np.exp(scores[group] - scores[group].max())
+        subgoal[group] = categorical(weights, weights.sum(), generator)
+    state.counts[:] = 0
+    for t in range(state.subgoal_of.shape[0]):
+        state.subgoal_of[t] = subgoal[state.partition_of[t]]
+        if state.switched[t]:
+            state.counts[state.subgoal_of[t]] += 1
+
+
+@njit(nogil=True, cache=True)
+def _draw_partitions(model, state, generator):  # type: ignore[no-untyped-def]
+    """Fill `partition_of`; returns the number of partitions."""
+    eta = state.parameters[ETA]
+    count = state.subgoal_of.shape[0]
+    seated = np.zeros(model.prior.shape[0], dtype=np.int64)
+    newest = np.full(model.prior.shape[0], -1, dtype=np.int64)
+    older = np.empty(count, dtype=np.int64)  # of each partition, one with the same subgoal
+    size = np.zeros(count, dtype=np.int64)
+    partitions = 0
+    for t in range(count):
+        if not state.switched[t]:
+            state.partition_of[t] = state.partition_of[t - 1]
+            continue
+        subgoal = state.subgoal_of[t]
+        remaining = generator.random() * (seated[subgoal] + eta * model.prior[subgoal])
+        partition = newest[subgoal]
+        while partition >= 0:
+            remaining -= size[partition]
+            if remaining < 0.0:
+                break
+            partition = older[partition]
+        if partition < 0:
+            partition = partitions
+            older[partition] = newest[subgoal]
+            newest[subgoal] = partition
+            partitions += 1
+        size[partition] += 1
+        seated[subgoal] += 1
+        state.partition_of[t] = partition
+    return partitions
+
+
+@njit(nogil=True, cache=True)
+def group_scores(model, state, chosen, groups):  # type: ignore[no-untyped-def]
+    """(J, G) log of P(g) times all probabilities in which a partition's subgoal occurs."""
+    parameters, candidates = state.parameters, model.prior.shape[0]
+    pairs = model.pair_state.shape[0]
+    tally = np.zeros((groups, pairs), dtype=np.int32)
+    part = np.zeros(groups, dtype=np.int64)
+    scores = np.zeros((groups, candidates))
+    for t in range(state.subgoal_of.shape[0]):
+        group = state.partition_of[t]
+        tally[group, model.pair_of[t]] += 1
+        part[group] = model.state_part[model.state_of[t]]
+        if model.starts[t]:
+            continue
+        group = state.partition_of[t - 1]
+        # What a candidate at which the demonstrator had arrived gains over the others.
+        usual = parameters[ELSEWHERE]
+        for candidate in near(model, t):
+            rho = switch_probability(model, parameters, t, candidate)
+            if state.switched[t]:
+                scores[group, candidate] += _log(rho) - _log(usual)
+            else:
+                scores[group, candidate] += _log(1.0 - rho) - _log(1.0 - usual)
+    slip = parameters[SLIP]
+    row = np.empty(candidates)
+    for pair in range(pairs):
+        known = False
+        for group in range(groups):
+            if tally[group, pair] > 0:
+                if not known:
+                    uniform = slip * model.uniform[model.pair_state[pair]]
+                    for candidate in range(candidates):
+                        row[candidate] = _log((1.0 - slip) * chosen[pair, candidate] + uniform)
+                    known = True
+                scores[group] += tally[group, pair] * row
+    for group in range(groups):
+        for candidate in range(candidates):
+            if model.candidate_part[candidate] == part[group]:
+                scores[group, candidate] += math.log(model.prior[candidate])
+            else:
+                scores[group, candidate] = -np.inf
+    return scores
+
+
+@njit(nogil=True, cache=True)
+def _log(probability):  # type: ignore[no-untyped-def]
+    """A logarithm of which differences can be taken: impossible is e^-690."""
+    return math.log(max(probability, 1e-300))
+
+
+@njit(nogil=True, cache=True)
+def _draw_slips(model, state, chosen, generator):  # type: ignore[no-untyped-def]
+    """Which actions are slips, and then the probability of one."""
+    slip = state.parameters[SLIP]
+    slips = 0
+    for t in range(state.subgoal_of.shape[0]):
+        unexplained = slip * model.uniform[model.state_of[t]]
+        explained = (1.0 - slip) * chosen[model.pair_of[t], state.subgoal_of[t]]
+        state.slipped[t] = generator.random() * (explained + unexplained) < unexplained
+        slips += state.slipped[t]
+    _draw_beta(model, state, SLIP, slips, state.subgoal_of.shape[0] - slips, generator)
+
+
+@njit(nogil=True, cache=True)
+def _draw_beta(model, state, parameter, successes, failures, generator):  # type: ignore[no-untyped-def]
+    if not model.is_fixed[parameter]:
+        a, b = model.hyper[parameter]
+        drawn = generator.beta(a + successes, b + failures)
+        # Off 0 and 1, which would rule out for ever what is only improbable.
+        state.parameters[parameter] = min(max(drawn, 1e-12), 1.0 - 1e-12)
+
+
+@njit(nogil=True, cache=True)
+def _draw_probabilities(model, state, generator):  # type: ignore[no-untyped-def]
+    """The three switch probabilities, given where there were switches."""
+    switches = np.zeros((3, 2), dtype=np.int64)
+    for t in range(1, state.subgoal_of.shape[0]):
+        if model.starts[t]:
+            continue
+        candidate = state.subgoal_of[t - 1]
+        place = 2
+        if model.arrived[model.state_of[t], candidate]:
+            place = 1 if model.arrived[model.state_of[t - 1], candidate] else 0
+        switches[place, 0 if state.switched[t] else 1] += 1
+    for place in range(3):
+        _draw_beta(
+            model, state, ON_ARRIVAL + place, switches[place, 0], switches[place, 1], generator
+        )
+
+
+@njit(nogil=True, cache=True)
+def _draw_concentration(model, state, generator):  # type: ignore[no-untyped-def]
+    """Eta, given the draws from the urns."""
+    drawn = np.zeros(model.parts, dtype=np.int64)
+    for candidate in range(state.counts.shape[0]):
+        drawn[model.candidate_part[candidate]] += state.counts[candidate]
+    nothing = np.empty((0, 1))
+    _draw_positive(model, state, ETA, (state.counts, drawn, nothing, nothing[:, 0]), generator)
+
+
+@njit(nogil=True, cache=True)
+def _draw_confidence(model, state, generator):  # type: ignore[no-untyped-def]
+    """Alpha, given which actions are slips and what the others cost."""
+    actions, candidates = model.cost.shape[1:]
+    keys = np.empty(state.subgoal_of.shape[0], dtype=np.int64)
+    explained = 0
+    for t in range(keys.shape[0]):
+        if not state.slipped[t]:
+            keys[explained] = model.pair_of[t] * candidates + state.subgoal_of[t]
+            explained += 1
+    keys = np.sort(keys[:explained])
+    costs = np.empty((explained, actions + 1))
+    times = np.zeros(explained)
+    rows = 0
+    for index in range(explained):
+        if index > 0 and keys[index] == keys[index - 1]:
+            times[rows - 1] += 1.0
+            continue
+        pair, candidate = keys[index] // candidates, keys[index] % candidates
+        cost = model.cost[model.pair_state[pair]]
+        costs[rows, 0] = cost[model.pair_action[pair], candidate]
+        costs[rows, 1:] = cost[:, candidate]
+        times[rows] = 1.0
+        rows += 1
+    none = state.counts[:0]
+    _draw_positive(model, state, ALPHA, (none, none, costs[:rows], times[:rows]), generator)
+
+
+@njit(nogil=True, cache=True)
+def _draw_positive(model, state, parameter, evidence, generator):  # type: ignore[no-untyped-def]
+    """Alpha or eta, by slice sampling of its logarithm (Neal 2003, stepping out)."""
+    now = math.log(state.parameters[parameter])
+    level = _log_density(model, parameter, evidence, now) - generator.standard_exponential()
+    low = now - _SLICE * generator.random()
+    high = low + _SLICE
+    while _log_density(model, parameter, evidence, low) > level:
+        low -= _SLICE
+    while _log_density(model, parameter, evidence, high) > level:
+        high += _SLICE
+    while True:
+        proposed = low + generator.random() * (high - low)
+        if _log_density(model, parameter, evidence, proposed) >= level:
+            break
+        if proposed < now:
+            low = proposed
+        else:
+            high = proposed
+    state.parameters[parameter] = math.exp(proposed)
+
+
+@njit(nogil=True, cache=True)
+def _log_density(model, parameter, evidence, log_value):  # type: ignore[no-untyped-def]
+    """Log density of the logarithm of alpha or eta, but for a constant.
+
+    The evidence on eta: (G,) draws of each candidate, and their number in each part. That on
+    alpha: costs (M, A + 1) of an action taken and of all it was chosen from, and (M,) how often.
+    """
+    value = math.exp(log_value)
+    median, sigma = model.hyper[parameter]
+    density = -0.5 * ((log_value - math.log(median)) / sigma) ** 2
+    counts, drawn, costs, times = evidence
+    for part in range(drawn.shape[0]):
+        density += math.lgamma(value) - math.lgamma(value + drawn[part])
+    for candidate in range(counts.shape[0]):
+        if counts[candidate] > 0:
+            weight = value * model.prior[candidate]
+            density += math.lgamma(weight + counts[candidate]) - math.lgamma(weight)
+    for row in range(costs.shape[0]):
+        total = 0.0
+        for action in range(1, costs.shape[1]):
+            total += math.exp(-value * costs[row, action])
+        density -= times[row] * (value * costs[row, 0] + math.log(total))
+    return density
+
+
+@njit(nogil=True, cache=True)
+def log_joint_of(model, state, chosen):  # type: ignore[no-untyped-def]
+    """As `PursuitModel.log_joint`."""
+    parameters, total = state.parameters, 0.0
+    for t in range(state.subgoal_of.shape[0]):
+        total += _log(likelihood(model, parameters, chosen, t, state.subgoal_of[t]))
+        if not model.starts[t]:
+            rho = switch_probability(model, parameters, t, state.subgoal_of[t - 1])
+            total += _log(rho if state.switched[t] else 1.0 - rho)
+    eta = parameters[ETA]
+    drawn = np.zeros(model.parts, dtype=np.int64)
+    for candidate in range(state.counts.shape[0]):
+        count = state.counts[candidate]
+        if count > 0:
+            weight = eta * model.prior[candidate]
+            total += math.lgamma(weight + count) - math.lgamma(weight)
+            drawn[model.candidate_part[candidate]] += count
+    for part in range(model.parts):
+        total += math.lgamma(eta) - math.lgamma(eta + drawn[part])
+    return total

@@ -1,0 +1,358 @@
+"""The posterior mode of the sequential model: the most probable pursuits.
+
+Coordinate ascent on the joint, with the weights of the subgoals integrated out and the parameters
+at their posterior medians, from the best draw of each chain: whole blocks of observations by the
+Viterbi algorithm, all pursuits of one subgoal at once, and subgoals of few pursuits given up.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from bnirl_ros.inference.draws import Draws
+from bnirl_ros.inference.mode import Mode
+from bnirl_ros.inference.pursuit_gibbs import (
+    ALPHA,
+    ELSEWHERE,
+    ETA,
+    SLIP,
+    PursuitState,
+    group_scores,
+    kernel_model,
+    likelihood,
+    log_joint_of,
+    near,
+    softmax_table,
+    switch_probability,
+    urn_ratio,
+    urn_weights,
+)
+from bnirl_ros.model.pursuits import PRIORS, PursuitModel
+
+_GAIN = 1e-9  # nats; a smaller gain is rounding
+_BLOCKS = (1024, 32)  # observations that the Viterbi algorithm takes at once
+_FEW = 4  # draws; a subgoal with more of them is not worth giving up
+_REPLACEMENTS = 8  # candidates tried in its place, the most likely ones
+
+
+def posterior_mode(model: PursuitModel, chains: Draws) -> Mode:
+    """The best pursuits that ascent reaches from the best draw of each chain.
+
+    A subgoal's partition is all observations that it explains; an observation that is more
+    probably a slip than not is in none.
+
+    Args:
+        model: the model that was sampled.
+        chains: draws with leading axes (chain, draw).
+    """
+    parameters = np.median(chains.parameters.reshape(-1, len(PRIORS)), axis=0)
+    best = chains.log_joint.argmax(axis=1)
+    with ThreadPoolExecutor(min(len(best), os.cpu_count() or 1)) as threads:
+        modes = threads.map(
+            lambda chain, draw: ascend(model, chains.subgoal_of[chain, draw], parameters),
+            range(len(best)),
+            best,
+        )
+        return max(modes, key=lambda mode: mode.log_joint)
+
+
+def ascend(
+    model: PursuitModel, subgoal_of: npt.ArrayLike, parameters: npt.NDArray[np.float64]
+) -> Mode:
+    """Coordinate ascent from a draw.
+
+    Args:
+        model: the model.
+        subgoal_of: (N,) candidate index of each observation's subgoal; -1 for a slip, which is
+            taken for part of the pursuit around it.
+        parameters: in the order of `PRIORS`.
+    """
+    subgoals = _persisting(np.asarray(subgoal_of, dtype=np.int32), model)
+    switched = model.starts | (np.diff(subgoals, prepend=subgoals[:1]) != 0)
+    rho = model.switch_probability(parameters)[np.arange(len(subgoals)), np.roll(subgoals, 1)]
+    switched |= rho == 1.0
+    state = PursuitState(
+        subgoal_of=subgoals,
+        switched=switched,
+        slipped=np.zeros(len(subgoals), dtype=np.bool_),
+        partition_of=np.zeros(len(subgoals), dtype=np.int32),
+        counts=np.bincount(subgoals[switched], minlength=len(model.prior)).astype(np.int64),
+        parameters=np.array(parameters, dtype=np.float64),
+        sweeps=np.zeros(1, dtype=np.int64),
+    )
+    value, slipped = _ascend(kernel_model(model), state)
+    labels, first, number = np.unique(
+        np.where(slipped, -1, subgoals), return_index=True, return_inverse=True
+    )
+    first[labels < 0] = -1  # slips come first, as -1
+    return Mode(
+        subgoal_of=np.where(slipped, -1, subgoals).astype(np.int32),
+        partition_of=(np.argsort(np.argsort(first))[number] - slipped.any()).astype(np.int32),
+        log_joint=value,
+    )
+
+
+def _persisting(subgoal_of: npt.NDArray[np.int32], model: PursuitModel) -> npt.NDArray[np.int32]:
+    """(N,) each slip with the subgoal before it, at the beginning of an episode that after it."""
+    subgoals = subgoal_of.copy()
+    for t in range(len(subgoals)):
+        if subgoals[t] < 0 and not model.starts[t]:
+            subgoals[t] = subgoals[t - 1]
+    for t in range(len(subgoals) - 1, -1, -1):
+        if subgoals[t] < 0:
+            last = t == len(subgoals) - 1 or bool(model.starts[t + 1])
+            here = model.candidate_part == model.state_part[model.state_of[t]]
+            subgoals[t] = here.argmax() if last else subgoals[t + 1]
+    return subgoals
+
+
+@njit(nogil=True, cache=True)
+def _ascend(model, state):  # type: ignore[no-untyped-def]
+    """Ascent that changes `state`; returns the log joint and (N,) which actions are slips."""
+    chosen = softmax_table(model, state.parameters[ALPHA])
+    likely = _log_likelihood(model, state.parameters, chosen)
+    value = _climb(model, state, chosen, likely)
+    gained = True
+    while gained:
+        gained = False
+        for candidate in range(state.counts.shape[0]):
+            if not 0 < state.counts[candidate] <= _FEW:
+                continue
+            # Given up (-1), or one of the most likely candidates in its place.
+            for replacement in _replacements(model, state, chosen, candidate):
+                subgoal_of, switched = state.subgoal_of.copy(), state.switched.copy()
+                if replacement < 0:
+                    _improve_blocks(model, state, likely, _BLOCKS[0], candidate, candidate)
+                else:
+                    _replace(state, candidate, replacement)
+                    for length in _BLOCKS:
+                        _improve_blocks(model, state, likely, length, replacement, -1)
+                trial = log_joint_of(model, state, chosen)
+                if trial > value + _GAIN:
+                    value = trial
+                    gained = True
+                    break
+                _restore(state, subgoal_of, switched)
+        if gained:
+            value = _climb(model, state, chosen, likely)
+    count = state.subgoal_of.shape[0]
+    slipped = np.empty(count, dtype=np.bool_)
+    for t in range(count):
+        unexplained = state.parameters[SLIP] * model.uniform[model.state_of[t]]
+        total = likelihood(model, state.parameters, chosen, t, state.subgoal_of[t])
+        slipped[t] = unexplained > 0.5 * total
+    return value, slipped
+
+
+@njit(nogil=True, cache=True)
+def _log_likelihood(model, parameters, chosen):  # type: ignore[no-untyped-def]
+    """(K, G) log P(a | s, g) of each distinct pair, slips included."""
+    table = np.empty_like(chosen)
+    for pair in range(chosen.shape[0]):
+        unexplained = parameters[SLIP] * model.uniform[model.pair_state[pair]]
+        table[pair] = np.log((1.0 - parameters[SLIP]) * chosen[pair] + unexplained)
+    return table
+
+
+@njit(nogil=True, cache=True)
+def _replacements(model, state, chosen, candidate):  # type: ignore[no-untyped-def]
+    """-1, and the candidates that suit the pursuits of one best."""
+    state.partition_of[:] = 1
+    for t in range(state.subgoal_of.shape[0]):
+        if state.subgoal_of[t] == candidate:
+            state.partition_of[t] = 0
+    scores = group_scores(model, state, chosen, 2)[0]
+    likely = scores.argsort()[::-1][:_REPLACEMENTS]
+    replacements = np.full(likely.shape[0] + 1, -1, dtype=np.int64)
+    replacements[1:] = likely
+    return replacements[(replacements < 0) | (replacements != candidate)]
+
+
+@njit(nogil=True, cache=True)
+def _replace(state, old, new):  # type: ignore[no-untyped-def]
+    """All pursuits of one subgoal become pursuits of another."""
+    for t in range(state.subgoal_of.shape[0]):
+        if state.subgoal_of[t] == old:
+            state.subgoal_of[t] = new
+    state.counts[new] += state.counts[old]
+    state.counts[old] = 0
+
+
+@njit(nogil=True, cache=True)
+def _restore(state, subgoal_of, switched):  # type: ignore[no-untyped-def]
+    state.subgoal_of[:] = subgoal_of
+    state.switched[:] = switched
+    state.counts[:] = 0
+    for t in range(switched.shape[0]):
+        if switched[t]:
+            state.counts[subgoal_of[t]] += 1
+
+
+@njit(nogil=True, cache=True)
+def _climb(model, state, chosen, likely):  # type: ignore[no-untyped-def]
+    """Blocks and whole subgoals in turn until nothing gains; returns the log joint."""
+    value = log_joint_of(model, state, chosen)
+    while True:
+        for length in _BLOCKS:
+            _improve_blocks(model, state, likely, length, -1, -1)
+        _move_subgoals(model, state, chosen)
+        now = log_joint_of(model, state, chosen)
+        if now <= value + _GAIN:
+            return now
+        value = now
+
+
+@njit(nogil=True, cache=True)
+def _improve_blocks(model, state, likely, length, concerned, forbidden):  # type: ignore[no-untyped-def]
+    """The best path through each block given the others, if it is better than the present one.
+
+    With a candidate `concerned`, only through the blocks where it occurs; if it is `forbidden`,
+    the best path without it.
+    """
+    count = model.starts.shape[0]
+    first = 0
+    while first < count:
+        end = first + 1
+        while end < count and end - first < length and not model.starts[end]:
+            end += 1
+        if concerned < 0 or (state.subgoal_of[first:end] == concerned).any():
+            _best_block(model, state, likely, first, end, forbidden)
+        first = end
+
+
+@njit(nogil=True, cache=True)
+def _best_block(model, state, likely, first, end, forbidden):  # type: ignore[no-untyped-def]
+    """The Viterbi algorithm over observations `first` to `end` of one episode."""
+    theta, parameters, counts = state.subgoal_of, state.parameters, state.counts
+    goes_on = end < model.starts.shape[0] and not model.starts[end]
+    if goes_on and theta[end] == forbidden and not state.switched[end]:
+        state.switched[end] = True  # the next block gives it another subgoal
+        counts[forbidden] += 1
+    goes_on = goes_on and theta[end] != forbidden
+    last = end + 1 if goes_on else end
+    part = model.state_part[model.state_of[first]]
+    # With the block's own draws: an estimate of the weights, where it is most of what there is.
+    weights = urn_weights(model, parameters[ETA], counts, part)
+    for t in range(first, last):
+        if state.switched[t]:
+            counts[theta[t]] -= 1
+    if forbidden >= 0:
+        weights[forbidden] = 0.0
+    new_theta, new_switched = _viterbi(model, parameters, likely, weights, theta, first, end, last)
+    gain = -np.inf
+    if forbidden < 0:
+        gain = _path_score(
+            model, parameters, likely, weights, new_theta, new_switched, theta, first
+        )
+        gain += urn_ratio(model, parameters[ETA], counts, weights, new_theta, new_switched)
+        old, switched = theta[first:last], state.switched[first:last]
+        gain -= _path_score(model, parameters, likely, weights, old, switched, theta, first)
+        gain -= urn_ratio(model, parameters[ETA], counts, weights, old, switched)
+    if forbidden >= 0 or gain > _GAIN:
+        theta[first:last] = new_theta
+        state.switched[first:last] = new_switched
+    for t in range(first, last):
+        if state.switched[t]:
+            counts[theta[t]] += 1
+
+
+@njit(nogil=True, cache=True)
+def _log(probability):  # type: ignore[no-untyped-def]
+    return math.log(probability) if probability > 0.0 else -np.inf
+
+
+@njit(nogil=True, cache=True)
+def _viterbi(model, parameters, likely, weights, theta, first, end, last):  # type: ignore[no-untyped-def]
+    """Subgoals and switches from `first` to `last`; `last` > `end` if the episode goes on.
+
+    `likely` (K, G) has the logarithms of the likelihoods.
+    """
+    candidates = weights.shape[0]
+    log_weights = np.empty(candidates)
+    for candidate in range(candidates):
+        log_weights[candidate] = _log(weights[candidate])
+    best = np.full(candidates, -np.inf)
+    if not model.starts[first]:
+        best[theta[first - 1]] = 0.0
+    came_by_switch = np.empty((last - first, candidates), dtype=np.bool_)
+    came_from = np.empty(last - first, dtype=np.int64)
+    leaving = np.empty(candidates)
+    elsewhere = parameters[ELSEWHERE]
+    for t in range(first, last):
+        i = t - first
+        if model.starts[t]:
+            best[:] = log_weights
+            came_by_switch[i] = True
+        else:
+            leaving[:] = best + _log(elsewhere)
+            keeping = best + _log(1.0 - elsewhere)
+            for candidate in near(model, t):
+                rho = switch_probability(model, parameters, t, candidate)
+                leaving[candidate] = best[candidate] + _log(rho)
+                keeping[candidate] = best[candidate] + _log(1.0 - rho)
+            came_from[i] = leaving.argmax()
+            leave = leaving[came_from[i]]
+            for candidate in range(candidates):
+                switched = leave + log_weights[candidate]
+                came_by_switch[i, candidate] = switched > keeping[candidate]
+                best[candidate] = max(keeping[candidate], switched)
+        if t < end:
+            best += likely[model.pair_of[t]]
+    new_theta = np.empty(last - first, dtype=np.int32)
+    new_switched = np.empty(last - first, dtype=np.bool_)
+    target = best.argmax() if last == end else theta[end]
+    for i in range(last - first - 1, -1, -1):
+        new_theta[i] = target
+        new_switched[i] = came_by_switch[i, target]
+        if new_switched[i] and i > 0:
+            target = came_from[i]
+    return new_theta, new_switched
+
+
+@njit(nogil=True, cache=True)
+def _path_score(model, parameters, likely, weights, path, switched, theta, first):  # type: ignore[no-untyped-def]
+    """Log probability of a path from `first` on, its draws made from `weights`."""
+    score = 0.0
+    for i in range(path.shape[0]):
+        t = first + i
+        if not model.starts[t]:
+            before = path[i - 1] if i > 0 else theta[first - 1]
+            rho = switch_probability(model, parameters, t, before)
+            score += math.log(max(rho if switched[i] else 1.0 - rho, 1e-300))
+        if switched[i]:
+            score += math.log(weights[path[i]])
+        score += likely[model.pair_of[t], path[i]]
+    return score
+
+
+@njit(nogil=True, cache=True)
+def _move_subgoals(model, state, chosen):  # type: ignore[no-untyped-def]
+    """All pursuits of a subgoal to the candidate that suits them best, if the joint gains."""
+    candidates = state.counts.shape[0]
+    group_of = np.full(candidates, -1, dtype=np.int32)
+    groups = 0
+    for t in range(state.subgoal_of.shape[0]):
+        if group_of[state.subgoal_of[t]] < 0:
+            group_of[state.subgoal_of[t]] = groups
+            groups += 1
+        state.partition_of[t] = group_of[state.subgoal_of[t]]
+    scores = group_scores(model, state, chosen, groups)
+    value = log_joint_of(model, state, chosen)
+    for old in range(candidates):
+        if group_of[old] < 0:
+            continue
+        new = scores[group_of[old]].argmax()
+        if new != old:
+            subgoal_of = state.subgoal_of.copy()
+            _replace(state, old, new)
+            trial = log_joint_of(model, state, chosen)
+            if trial > value + _GAIN:
+                value = trial
+            else:
+                _restore(state, subgoal_of, state.switched)

@@ -1,0 +1,228 @@
+"""The sequential model: a demonstrator pursues one subgoal until it gets there.
+
+A family with the paper's mixture at one end. The subgoals that are pursued one after the other are
+drawn from weights over the candidates with a Dirichlet prior, Dirichlet(eta P(g)), which is the
+Chinese restaurant process on a discrete base. The subgoal is kept from one observation to the next
+but for a switch, whose probability depends on whether the demonstrator has arrived. With a switch
+at every observation, no slips and the likelihood (7), the observations are exchangeable and the
+model is the paper's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from bnirl_ros.mdp.goal_values import MarkovDecisionProcess, goal_values
+from bnirl_ros.model.likelihood import delays, value_losses
+
+_VALUE_TOLERANCE = 1e-13  # delays are ratios of values, which fall off with the distance
+
+
+class Prior(NamedTuple):
+    """Prior of a parameter: log-normal or beta.
+
+    Attributes:
+        family: "log-normal", with median and standard deviation of the logarithm, or "beta".
+        first, second: the two numbers of the family.
+    """
+
+    family: str
+    first: float
+    second: float
+
+    def __str__(self) -> str:
+        if self.family == "beta":
+            return f"Beta({self.first:g}, {self.second:g})"
+        return f"log-normal, median {self.first:g}, sigma {self.second:g}"
+
+    def draw(self, generator: np.random.Generator) -> float:
+        """A value from the prior."""
+        if self.family == "beta":
+            return float(generator.beta(self.first, self.second))
+        return float(self.first * math.exp(self.second * generator.standard_normal()))
+
+
+PRIORS: dict[str, Prior] = {
+    "alpha": Prior("log-normal", 3.0, 1.0),
+    "eta": Prior("log-normal", 3.0, 1.0),
+    "slip": Prior("beta", 1.0, 9.0),
+    "switch_on_arrival": Prior("beta", 1.0, 1.0),
+    "switch_at_subgoal": Prior("beta", 1.0, 1.0),
+    "switch_elsewhere": Prior("beta", 1.0, 19.0),
+}
+"""The parameters of the model, in the order in which they are drawn, and their weak priors.
+
+alpha: confidence, nats for each step that an action costs (for likelihood (7), `VALUE_ALPHA`).
+eta: concentration of the subgoals' weights.
+slip: probability epsilon that an action is not explained by the subgoal, but uniform.
+switch_on_arrival: probability rho that the next subgoal is drawn in the first state in which the
+demonstrator is at its subgoal; it passes through.
+switch_at_subgoal: the same in every further state there; it has stayed.
+switch_elsewhere: the same everywhere else; it changed its mind.
+"""
+
+VALUE_ALPHA = Prior("log-normal", 50.0, 1.5)
+"""The prior of alpha where the cost of an action is what it loses of Q*, as in (7)."""
+
+
+@dataclass(frozen=True, eq=False)
+class PursuitModel:
+    """The sequential model of N observations with G candidate subgoals.
+
+    For each observation t, in the order of a demonstration: theta_t is the subgoal. In an
+    episode's first observation it is a fresh draw from the weights; in each other one it is, with
+    probability rho, and else theta_(t-1). rho is judged in the state of observation t, by
+    theta_(t-1). The weights, integrated out, are those of an urn of each `part`.
+
+    Attributes:
+        cost: (U, A, G) float64 what each action costs in each state; infinite for an action that
+            is never observed, as it does the same as another.
+        state_of: (N,) int64 row of `cost` for each observation.
+        action_of: (N,) int64 column of `cost` for each observation.
+        starts: (N,) bool which observations begin an episode.
+        arrived: (U, G) bool whether a state counts as being at the subgoal.
+        state_part: (U,) int64 connected part of the map in which each state lies.
+        candidate_part: (G,) int64 the same for the candidates: only those of the same part are
+            ever pursued, so P(g) and the urn are each part's own.
+        fixed: values of the parameters in `PRIORS` that are not inferred.
+        priors: of the parameters that are.
+    """
+
+    cost: npt.NDArray[np.float64]
+    state_of: npt.NDArray[np.int64]
+    action_of: npt.NDArray[np.int64]
+    starts: npt.NDArray[np.bool_]
+    arrived: npt.NDArray[np.bool_]
+    state_part: npt.NDArray[np.int64]
+    candidate_part: npt.NDArray[np.int64]
+    fixed: Mapping[str, float]
+    priors: Mapping[str, Prior]
+
+    @cached_property
+    def prior(self) -> npt.NDArray[np.float64]:
+        """(G,) P(g): uniform over the candidates of each part."""
+        return 1.0 / np.bincount(self.candidate_part)[self.candidate_part]
+
+    @cached_property
+    def uniform(self) -> npt.NDArray[np.float64]:
+        """(U,) probability of an action that is a slip: one over the actions that differ."""
+        return 1.0 / np.isfinite(self.cost[:, :, 0]).sum(axis=1)
+
+    def action_likelihood(self, parameters: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """(U, A, G) P(a | s, g), slips included, with parameters in the order of `PRIORS`."""
+        alpha, slip = parameters[0], parameters[2]
+        weights = np.exp(-alpha * self.cost)
+        chosen = weights / weights.sum(axis=1, keepdims=True)
+        uniform = np.isfinite(self.cost) * self.uniform[:, None, None]
+        return np.asarray((1.0 - slip) * chosen + slip * uniform)
+
+    def switch_probability(self, parameters: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """(N, G) rho before each observation, by the subgoal until then; 1 at a start."""
+        on_arrival, at_subgoal, elsewhere = parameters[3:]
+        here = self.arrived[self.state_of]
+        before = np.roll(here, 1, axis=0)
+        rho = np.where(here, np.where(before, at_subgoal, on_arrival), elsewhere)
+        rho[self.starts] = 1.0
+        return rho
+
+    def log_joint(
+        self,
+        subgoal_of: npt.ArrayLike,
+        switched: npt.ArrayLike,
+        parameters: npt.NDArray[np.float64],
+    ) -> float:
+        """Log P(subgoals, switches, actions | parameters), weights and slips integrated out.
+
+        Args:
+            subgoal_of: (N,) candidate index theta of each observation's subgoal.
+            switched: (N,) bool whether it is a draw of its own.
+            parameters: in the order of `PRIORS`.
+        """
+        subgoals, switched = np.asarray(subgoal_of), np.asarray(switched, dtype=np.bool_)
+        likelihood = self.action_likelihood(parameters)
+        probability = likelihood[self.state_of, self.action_of, subgoals]
+        rho = self.switch_probability(parameters)[np.arange(len(subgoals)), np.roll(subgoals, 1)]
+        eta = parameters[1]
+        counts = np.bincount(subgoals[switched], minlength=len(self.prior))
+        with np.errstate(divide="ignore"):
+            total = np.log(probability).sum() + np.log(np.where(switched, rho, 1.0 - rho)).sum()
+        for part in np.unique(self.candidate_part):
+            here = self.candidate_part == part
+            total += _log_urn(counts[here], eta * self.prior[here])
+        return float(total)
+
+
+def _log_urn(counts: npt.NDArray[np.int64], weights: npt.NDArray[np.float64]) -> float:
+    """Log probability of a sequence of draws from a Polya urn, whatever their order."""
+    drawn = counts > 0
+    each = sum(
+        math.lgamma(weight + count) - math.lgamma(weight)
+        for weight, count in zip(weights[drawn], counts[drawn], strict=True)
+    )
+    return each + math.lgamma(weights.sum()) - math.lgamma(weights.sum() + counts.sum())
+
+
+def pursuit_model(
+    mdp: MarkovDecisionProcess,
+    states: npt.ArrayLike,
+    actions: npt.ArrayLike,
+    starts: npt.ArrayLike,
+    candidates: npt.ArrayLike,
+    arrived: npt.NDArray[np.bool_] | None = None,
+    likelihood: str = "delay",
+    fixed: Mapping[str, float] | None = None,
+) -> PursuitModel:
+    """The sequential model of a demonstration.
+
+    Args:
+        mdp: the grid world or finite MDP in which the observations were made.
+        states: (N,) state number of each observation, in order.
+        actions: (N,) its action, one of `mdp.actions`.
+        starts: (N,) bool which observations begin an episode.
+        candidates: (G,) state numbers in the support of P(g).
+        arrived: (U, G) whether each distinct state, in ascending order, counts as being at a
+            candidate; by default only the candidate itself.
+        likelihood: "delay": actions cost steps, those that do the same are one action; "value":
+            they cost value, equation (7) to the letter.
+        fixed: values of parameters in `PRIORS` that are not to be inferred.
+
+    Raises:
+        ValueError: an observation lies where no candidate can be reached.
+    """
+    goals = np.asarray(candidates, dtype=np.int64)
+    visited, state_of = np.unique(np.asarray(states, dtype=np.int64), return_inverse=True)
+    action_of = np.searchsorted(mdp.actions, np.asarray(actions))
+    parts = np.unique(
+        np.concatenate([mdp.parts_of(visited), mdp.parts_of(goals)]), return_inverse=True
+    )[1]
+    state_part, candidate_part = parts[: len(visited)], parts[len(visited) :]
+    if not np.isin(state_part, candidate_part).all():
+        raise ValueError("an observation lies where no candidate can be reached")
+    values = goal_values(mdp, goals, visited, _VALUE_TOLERANCE)
+    priors = dict(PRIORS)
+    if likelihood == "delay":
+        same = mdp.same_action(visited)
+        action_of = same[state_of, action_of]
+        redundant = same != np.arange(same.shape[1])
+        cost = np.where(redundant[:, :, None], np.inf, delays(values, mdp.discount))
+    else:
+        cost = value_losses(values)
+        priors["alpha"] = VALUE_ALPHA
+    return PursuitModel(
+        cost=cost,
+        state_of=state_of.astype(np.int64),
+        action_of=action_of.astype(np.int64),
+        starts=np.asarray(starts, dtype=np.bool_),
+        arrived=visited[:, None] == goals if arrived is None else arrived,
+        state_part=state_part,
+        candidate_part=candidate_part,
+        fixed=dict(fixed or {}),
+        priors=priors,
+    )
