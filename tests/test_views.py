@@ -187,6 +187,19 @@ def test_assignments_are_lines_over_distinct_pairs_in_the_map_frame(summary, gri
     assert ends[1::2] - ends[::2] == pytest.approx(np.array([[-0.2, 0.2], [0.0, 0.2]]))
 
 
+def test_unexplained_assignments_are_grey_lines_of_their_own(summary, grid_map):
+    slips = dataclasses.replace(summary, rank_of=np.array([0, 0, 1, 0, 3]))
+    of_rank = {m.id: m for m in assignment_markers(slips, grid_map, STAMP).markers[1:]}
+    assert set(of_rank) == {0, 1, 2, 3}
+    grey = of_rank[0]
+    assert (grey.type, grey.ns) == (Marker.LINE_LIST, "assignment")
+    assert (grey.color.r, grey.color.g, grey.color.b) == UNEXPLAINED
+    assert len(grey.points) == 2 + 4  # a move, and the cross of staying
+    assert of_rank[2].points == []
+    nothing = dataclasses.replace(slips, subgoals=(), visit_sequence=(), rank_of=0 * slips.rank_of)
+    assert [m.id for m in assignment_markers(nothing, grid_map, STAMP).markers[1:]] == [0]
+
+
 def test_staying_is_a_cross_around_the_centre_of_its_cell(summary, grid_map):
     of_rank = {m.id: m for m in assignment_markers(summary, grid_map, STAMP).markers[1:]}
     ends = np.array([(point.x, point.y) for point in of_rank[2].points])
@@ -320,7 +333,7 @@ def perceived(colours: list[tuple[float, float, float]], vision: str) -> np.ndar
 def test_twelve_ranks_and_the_unexplained_can_be_told_apart(vision):
     # About 0.02 in OKLab is just noticeable side by side; the first six, the usual case, keep
     # far more.
-    lab = perceived([*(colour_of(rank) for rank in range(1, 13)), UNEXPLAINED], vision)
+    lab = perceived([colour_of(rank) for rank in [*range(1, 13), 0]], vision)
     apart = np.linalg.norm(lab[:, np.newaxis] - lab, axis=2)
     others = apart[~np.eye(len(lab), dtype=bool)]
     assert others.min() > 0.06
@@ -329,6 +342,7 @@ def test_twelve_ranks_and_the_unexplained_can_be_told_apart(vision):
 
 
 def test_the_colours_after_the_palette_are_its_variations_and_stay_in_range():
+    assert colour_of(0) == UNEXPLAINED
     colours = [colour_of(rank) for rank in range(1, 37)]
     assert len(set(colours)) == 36
     assert colour_of(37) == colour_of(1)
@@ -356,7 +370,7 @@ def test_the_picture_holds_every_subgoal_in_its_colour(tmp_path, summary, grid_m
 
 
 def test_the_picture_shows_unexplained_observations_in_grey(tmp_path, summary, grid_map):
-    slip = dataclasses.replace(summary, rank_of=np.array([1, 1, -1, 2, 3]))
+    slip = dataclasses.replace(summary, rank_of=np.array([1, 1, 0, 2, 3]))
     draw_summary(slip, grid_map, tmp_path / "subgoals.png")
     assert as_bytes(UNEXPLAINED) in colours_in(tmp_path / "subgoals.png")
 

@@ -34,7 +34,9 @@ _VARIATIONS: tuple[tuple[float, float], ...] = ((0.0, 0.0), (1.0, 0.45), (0.0, 0
 
 
 def colour_of(rank: int) -> Colour:
-    """Colour of the subgoal of this rank, from 1 on; the first 36 ranks have one of their own."""
+    """Colour of the subgoal of this rank, 0 for none; the first 36 have one of their own."""
+    if rank == 0:
+        return UNEXPLAINED
     turn, place = divmod(rank - 1, len(_PALETTE))
     towards, share = _VARIATIONS[turn % len(_VARIATIONS)]
     code = _PALETTE[place]

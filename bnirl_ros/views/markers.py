@@ -56,7 +56,7 @@ def assignment_markers(summary: Summary, grid_map: GridMap, stamp_ns: int) -> Ma
 
     A move is a line from the centre of its cell along the action, staying a small cross. The
     points are in the map frame, the namespace is `assignment`, the id is the rank, the first
-    marker DELETEALL.
+    marker DELETEALL. Where observations are unexplained, one more, grey, has the id 0.
 
     Args:
         summary: the posterior.
@@ -65,20 +65,19 @@ def assignment_markers(summary: Summary, grid_map: GridMap, stamp_ns: int) -> Ma
     """
     header = header_of(grid_map.frame_id, stamp_ns)
     markers = [_delete_all(header)]
-    for subgoal in summary.subgoals:
-        pairs = np.unique(
-            summary.observations[summary.rank_of == subgoal.rank, 1:].reshape(-1, 3), axis=0
-        )
+    unexplained = [0] if (summary.rank_of == 0).any() else []
+    for rank in unexplained + [subgoal.rank for subgoal in summary.subgoals]:
+        pairs = np.unique(summary.observations[summary.rank_of == rank, 1:].reshape(-1, 3), axis=0)
         ends = grid_map.centres_of(_lines(pairs).reshape(-1, 2))
         markers.append(
             Marker(
                 header=header,
                 ns="assignment",
-                id=subgoal.rank,
+                id=rank,
                 type=Marker.LINE_LIST,
                 action=Marker.ADD,
                 scale=Vector3(x=0.08 * grid_map.resolution),
-                color=_opaque(colour_of(subgoal.rank)),
+                color=_opaque(colour_of(rank)),
                 points=[Point(x=x, y=y) for x, y in ends.tolist()],
             )
         )

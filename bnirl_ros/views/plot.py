@@ -168,10 +168,7 @@ def _draw_map(axes: Any, grid_map: GridMap, layout: _Layout) -> None:
 def _draw_observations(axes: Any, summary: Summary, layout: _Layout) -> None:
     keys = np.column_stack([summary.observations[:, 1:], summary.rank_of]).reshape(-1, 4)
     distinct, counts = np.unique(keys, axis=0, return_counts=True)
-    known = {subgoal.rank: colour_of(subgoal.rank) for subgoal in summary.subgoals}
-    colours = np.array([known.get(rank, UNEXPLAINED) for rank in distinct[:, 3].tolist()]).reshape(
-        -1, 3
-    )
+    colours = np.array([colour_of(rank) for rank in distinct[:, 3].tolist()]).reshape(-1, 3)
     steps = STEPS[distinct[:, 2]]
     if layout.cell < _ARROWS_FROM:
         diameter = max(_SMALLEST_DOT, 0.8 * layout.cell)
@@ -448,8 +445,7 @@ def _draw_legend(figure: Any, summary: Summary, layout: _Layout) -> None:
         y += _LEGEND_LINE
     legend.plot(columns[0], y, marker="o", markersize=4, color=colour_of(1), markeredgewidth=0)
     write(key, y, _key_of_observations(layout), faint=True, right=False)
-    ranks = [subgoal.rank for subgoal in summary.subgoals]
-    if not np.isin(summary.rank_of, ranks).all():
+    if (summary.rank_of == 0).any():
         y += _LEGEND_LINE
         legend.plot(columns[0], y, marker="o", markersize=4, color=UNEXPLAINED, markeredgewidth=0)
         write(key, y, "explained by no subgoal", faint=True, right=False)
