@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bnirl_ros.inference.summary import Subgoal, Summary
+from bnirl_ros.inference.settings import Settings
+from bnirl_ros.inference.summary import Parameter, Pursuit, Subgoal, Summary, nothing_found
 from bnirl_ros.maps import GridMap, map_from_occupancy, yaw_of
 from bnirl_ros.mdp.actions import ACTION_NAMES
 from bnirl_ros.views.belief import belief_grid, map_message
@@ -23,6 +24,7 @@ from bnirl_ros.views.demonstration import action_message, pose_message
 from bnirl_ros.views.markers import assignment_markers, subgoal_markers
 from bnirl_ros.views.messages import Marker, MarkerArray, Pose
 from bnirl_ros.views.plot import draw_summary
+from bnirl_ros.views.results import subgoals_document, subgoals_in
 from bnirl_ros.views.tables import subgoal_table
 from bnirl_ros.views.waypoints import headings, waypoint_path
 
@@ -80,6 +82,30 @@ def summary(grid_map: GridMap) -> Summary:
     )
 
 
+@pytest.fixture
+def sequence(summary: Summary) -> Summary:
+    """The same, of a model that knows pursuits: one observation of five is a slip."""
+    return dataclasses.replace(
+        summary,
+        subgoals=tuple(
+            dataclasses.replace(subgoal, pursuits=pursuits)
+            for subgoal, pursuits in zip(summary.subgoals, (1.96, 1.0, 0.5), strict=True)
+        ),
+        rank_of=np.array([1, 0, 1, 2, 3]),
+        pursuits=(
+            Pursuit(episode=0, rank=1, first=0, last=2, arrived=True),
+            Pursuit(episode=0, rank=2, first=3, last=3, arrived=False),
+            Pursuit(episode=1, rank=3, first=4, last=4, arrived=True),
+        ),
+        unexplained=0.1875,
+        parameters=(
+            Parameter("alpha", 3.25, (2.875, 4.0), inferred=True),
+            Parameter("eta", 1.0, (1.0, 1.0), inferred=False),
+            Parameter("slip", 0.03125, (0.0125, 0.0625), inferred=True),
+        ),
+    )
+
+
 def numbers(value: object) -> Iterator[float]:
     """Every float within a message."""
     if dataclasses.is_dataclass(value):
@@ -90,6 +116,17 @@ def numbers(value: object) -> Iterator[float]:
             yield from numbers(item)
     elif isinstance(value, float):
         yield value
+
+
+def all_unexplained(summary: Summary) -> Summary:
+    return dataclasses.replace(
+        summary,
+        subgoals=(),
+        visit_sequence=(),
+        rank_of=np.zeros_like(summary.rank_of),
+        pursuits=(),
+        unexplained=1.0,
+    )
 
 
 def yaw_in(pose: Pose) -> float:
@@ -196,8 +233,8 @@ def test_unexplained_assignments_are_grey_lines_of_their_own(summary, grid_map):
     assert (grey.color.r, grey.color.g, grey.color.b) == UNEXPLAINED
     assert len(grey.points) == 2 + 4  # a move, and the cross of staying
     assert of_rank[2].points == []
-    nothing = dataclasses.replace(slips, subgoals=(), visit_sequence=(), rank_of=0 * slips.rank_of)
-    assert [m.id for m in assignment_markers(nothing, grid_map, STAMP).markers[1:]] == [0]
+    nothing = assignment_markers(all_unexplained(summary), grid_map, STAMP)
+    assert [marker.id for marker in nothing.markers[1:]] == [0]
 
 
 def test_staying_is_a_cross_around_the_centre_of_its_cell(summary, grid_map):
@@ -283,6 +320,53 @@ def test_the_table_says_what_the_summary_says(summary):
         "   2  (0, 0)  (9.75, 20.25)         0.99             1      1",
         "   3  (4, 0)  (9.75, 22.25)         0.50             1      3",
     ]
+
+
+CONTRACT = ["format", "frame_id", "resolution", "model", "subgoals", "visit_sequence"]
+CONTRACT_OF_SUBGOAL = ["rank", "cell", "position", "probability", "observations", "visit_order"]
+
+
+def test_the_document_of_the_papers_model_keeps_to_the_contract(summary, grid_map):
+    document = subgoals_document(summary, grid_map, Settings(alpha=7.0, eta=2.0))
+    assert list(document) == [*CONTRACT, "diagnostics"]
+    assert list(document["subgoals"][0]) == CONTRACT_OF_SUBGOAL
+    assert (document["model"]["alpha"], document["model"]["eta"]) == (7.0, 2.0)
+    assert subgoals_in(json.loads(json.dumps(document))) == summary.subgoals
+
+
+def test_the_document_tells_pursuits_slips_and_parameters(sequence, grid_map):
+    written = json.dumps(subgoals_document(sequence, grid_map, Settings(alpha=7.0, eta=2.0)))
+    document = json.loads(written)
+    added = ["repetitions", "episodes", "unexplained", "parameters"]
+    assert list(document) == [*CONTRACT, *added, "diagnostics"]
+    assert list(document["subgoals"][0]) == [*CONTRACT_OF_SUBGOAL, "pursuits"]
+    assert subgoals_in(document) == sequence.subgoals
+    assert document["repetitions"] == 0
+    assert document["unexplained"] == 0.1875
+    assert document["episodes"] == [
+        {
+            "episode": 0,
+            "pursuits": [
+                {"rank": 1, "first": 0, "last": 2, "arrived": True},
+                {"rank": 2, "first": 3, "last": 3, "arrived": False},
+            ],
+        },
+        {"episode": 1, "pursuits": [{"rank": 3, "first": 4, "last": 4, "arrived": True}]},
+    ]
+    assert document["parameters"] == {
+        "alpha": {"median": 3.25, "interval": [2.875, 4.0], "inferred": True},
+        "eta": {"median": 1.0, "interval": [1.0, 1.0], "inferred": False},
+        "slip": {"median": 0.03125, "interval": [0.0125, 0.0625], "inferred": True},
+    }
+    assert (document["model"]["alpha"], document["model"]["eta"]) == (3.25, 1.0)
+
+
+def test_the_document_of_slips_alone_lists_episodes_without_pursuits(sequence, grid_map):
+    document = subgoals_document(all_unexplained(sequence), grid_map, Settings())
+    assert document["subgoals"] == []
+    assert document["episodes"] == [{"episode": n, "pursuits": []} for n in (0, 1)]
+    assert document["unexplained"] == 1.0
+    assert "episodes" not in subgoals_document(nothing_found(grid_map), grid_map, Settings())
 
 
 # Matrices on linear RGB of Machado, Oliveira & Fernandes (2009), severity 1.

@@ -19,6 +19,7 @@ from bnirl_ros.inference.settings import Settings
 from bnirl_ros.inference.summary import Subgoal, Summary
 from bnirl_ros.maps.grid_map import GridMap
 from bnirl_ros.views.plot import draw_summary
+from bnirl_ros.views.pursuits import knows_pursuits, pursuits_by_episode
 
 FORMAT = 1
 """Format number of subgoals.json; added fields keep it."""
@@ -79,15 +80,23 @@ def _unwritable(folder: Path, error: OSError) -> InputError:
 
 
 def subgoals_document(summary: Summary, grid_map: GridMap, settings: Settings) -> dict[str, Any]:
-    """The content of subgoals.json."""
+    """The content of subgoals.json.
+
+    A model that knows pursuits adds to each subgoal the expected number of its `pursuits`, and
+    below `visit_sequence` how often the pursuits go round it (`repetitions`, 0 for no loop), the
+    pursuits of each of the `episodes`, from `first` to `last` by rows of `observations` in
+    posterior.npz, and the expected share of `unexplained` observations. `parameters` are there
+    where the summary tells them, with median and central 90 % of the posterior.
+    """
+    known = {parameter.name: parameter.median for parameter in summary.parameters}
     return {
         "format": FORMAT,
         "frame_id": grid_map.frame_id,
         "resolution": grid_map.resolution,
         "model": {
             "name": settings.model,
-            "alpha": settings.fixed.get("alpha"),
-            "eta": settings.fixed.get("eta"),
+            "alpha": known.get("alpha", settings.fixed.get("alpha")),
+            "eta": known.get("eta", settings.fixed.get("eta")),
             "discount": settings.discount,
             "success": settings.success,
         },
@@ -99,16 +108,60 @@ def subgoals_document(summary: Summary, grid_map: GridMap, settings: Settings) -
                 "probability": subgoal.probability,
                 "observations": subgoal.observations,
                 "visit_order": list(subgoal.visit_order),
+                **({} if subgoal.pursuits is None else {"pursuits": subgoal.pursuits}),
             }
             for subgoal in summary.subgoals
         ],
         "visit_sequence": list(summary.visit_sequence),
+        **_pursuits(summary),
+        **_parameters(summary),
         "diagnostics": {
             "rhat": _finite(summary.rhat),
             "ess": _finite(summary.ess),
             "chains": summary.chains,
             "draws": summary.draws,
         },
+    }
+
+
+def _pursuits(summary: Summary) -> dict[str, Any]:
+    """What the document tells of pursuits and slips; nothing for a model that knows none."""
+    if not knows_pursuits(summary):
+        return {}
+    return {
+        "repetitions": summary.repetitions,
+        "episodes": [
+            {
+                "episode": episode,
+                "pursuits": [
+                    {
+                        "rank": pursuit.rank,
+                        "first": pursuit.first,
+                        "last": pursuit.last,
+                        "arrived": pursuit.arrived,
+                    }
+                    for pursuit in pursuits
+                ],
+            }
+            for episode, pursuits in pursuits_by_episode(summary).items()
+        ],
+        "unexplained": summary.unexplained,
+    }
+
+
+def _parameters(summary: Summary) -> dict[str, Any]:
+    """What the document tells of the model's parameters, where the summary has any."""
+    if not summary.parameters:
+        return {}
+    return {
+        "parameters": {
+            parameter.name: {
+                "median": parameter.median,
+                "interval": list(parameter.interval),
+                "inferred": parameter.inferred,
+            }
+            for parameter in summary.parameters
+        }
     }
 
 
@@ -122,6 +175,7 @@ def subgoals_in(document: Mapping[str, Any]) -> tuple[Subgoal, ...]:
             probability=entry["probability"],
             observations=entry["observations"],
             visit_order=tuple(entry["visit_order"]),
+            pursuits=entry.get("pursuits"),
         )
         for entry in document["subgoals"]
     )
