@@ -25,7 +25,7 @@ from bnirl_ros.views.markers import assignment_markers, subgoal_markers
 from bnirl_ros.views.messages import Marker, MarkerArray, Pose
 from bnirl_ros.views.plot import draw_summary
 from bnirl_ros.views.results import subgoals_document, subgoals_in
-from bnirl_ros.views.tables import subgoal_table
+from bnirl_ros.views.tables import convergence, report, subgoal_table
 from bnirl_ros.views.waypoints import headings, waypoint_path
 
 STAMP = 12_345_678_901
@@ -320,6 +320,39 @@ def test_the_table_says_what_the_summary_says(summary):
         "   2  (0, 0)  (9.75, 20.25)         0.99             1      1",
         "   3  (4, 0)  (9.75, 22.25)         0.50             1      3",
     ]
+
+
+def test_the_report_of_the_papers_model_is_its_table_and_the_chains(summary):
+    table = subgoal_table(summary.subgoals, summary.visit_sequence)
+    assert report(summary) == f"{table}\n{convergence(summary)}"
+
+
+def test_the_report_tells_pursuits_slips_loop_and_parameters(sequence):
+    assert report(dataclasses.replace(sequence, repetitions=3)).splitlines() == [
+        "rank    cell      place [m]  probability  observations  pursuits  order",
+        "   1  (4, 2)  (8.75, 22.25)         1.00             3       2.0      2",
+        "   2  (0, 0)  (9.75, 20.25)         0.99             1       1.0      1",
+        "   3  (4, 0)  (9.75, 22.25)         0.50             1       0.5      3",
+        "the visits go round 3 times",
+        "unexplained: 18.8 % of the observations",
+        "parameter  median     90 % interval",
+        "    alpha    3.25         2.88 to 4",
+        "      eta       1             fixed",
+        "     slip  0.0312  0.0125 to 0.0625",
+        convergence(sequence),
+    ]
+    for repetitions in (0, 1):
+        once = dataclasses.replace(sequence, repetitions=repetitions)
+        assert "go round" not in report(once)
+
+
+def test_the_report_without_a_subgoal(sequence, grid_map):
+    lines = report(all_unexplained(sequence)).splitlines()
+    assert lines[:2] == [
+        "rank  cell  place [m]  probability  observations  order",
+        "unexplained: 100 % of the observations",
+    ]
+    assert len(report(nothing_found(grid_map)).splitlines()) == 2
 
 
 CONTRACT = ["format", "frame_id", "resolution", "model", "subgoals", "visit_sequence"]

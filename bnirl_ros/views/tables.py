@@ -1,34 +1,74 @@
-"""The subgoals as a table for the terminal."""
+"""What a posterior says, as text for the terminal."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from bnirl_ros.inference.summary import Subgoal, Summary
+from bnirl_ros.inference.summary import Parameter, Subgoal, Summary
+from bnirl_ros.views.pursuits import knows_pursuits, unexplained_share
 
-_HEADINGS = ("rank", "cell", "place [m]", "probability", "observations", "order")
+
+def report(summary: Summary) -> str:
+    """All that a summary tells on the terminal, line by line; no newline at the end.
+
+    Above all the subgoals, then slips, loop and parameters where the model knows them, and last
+    how far the chains agree.
+    """
+    lines = [subgoal_table(summary.subgoals, summary.visit_sequence)]
+    if summary.repetitions > 1:
+        lines.append(f"the visits go round {summary.repetitions} times")
+    if knows_pursuits(summary):
+        lines.append(f"unexplained: {unexplained_share(summary)} of the observations")
+    if summary.parameters:
+        lines.append(parameter_table(summary.parameters))
+    return "\n".join([*lines, convergence(summary)])
 
 
 def subgoal_table(subgoals: Sequence[Subgoal], visit_sequence: Sequence[int]) -> str:
-    """One aligned line for each subgoal below a line of headings; no newline at the end.
+    """The columns of the subgoals side by side, a line for each; no newline at the end."""
+    columns = subgoal_columns(subgoals, visit_sequence).items()
+    return _aligned(list(zip(*([heading, *texts] for heading, texts in columns), strict=True)))
+
+
+def subgoal_columns(
+    subgoals: Sequence[Subgoal], visit_sequence: Sequence[int]
+) -> dict[str, list[str]]:
+    """What a table tells of the subgoals, by heading.
 
     Columns: rank; cell (x, y); place, the centre of the cell in the map frame [m]; probability;
-    number of observations; order, the 1-based position in the visit sequence.
+    number of observations; where the model knows pursuits, their expected number; order, the
+    1-based position in the visit sequence.
     """
+    columns = {
+        "rank": [str(subgoal.rank) for subgoal in subgoals],
+        "cell": ["({}, {})".format(*subgoal.cell) for subgoal in subgoals],
+        "place [m]": ["({:.2f}, {:.2f})".format(*subgoal.position) for subgoal in subgoals],
+        "probability": [f"{subgoal.probability:.2f}" for subgoal in subgoals],
+        "observations": [str(subgoal.observations) for subgoal in subgoals],
+    }
+    pursuits = [subgoal.pursuits for subgoal in subgoals if subgoal.pursuits is not None]
+    if pursuits:
+        columns["pursuits"] = [f"{expected:.1f}" for expected in pursuits]
     order = {rank: position for position, rank in enumerate(visit_sequence, start=1)}
+    return columns | {"order": [str(order.get(subgoal.rank, "-")) for subgoal in subgoals]}
+
+
+def parameter_table(parameters: Sequence[Parameter]) -> str:
+    """One aligned line for each parameter: name, median, and 90 % interval or 'fixed'."""
     rows = [
         (
-            str(subgoal.rank),
-            "({}, {})".format(*subgoal.cell),
-            "({:.2f}, {:.2f})".format(*subgoal.position),
-            f"{subgoal.probability:.2f}",
-            str(subgoal.observations),
-            str(order.get(subgoal.rank, "-")),
+            parameter.name,
+            f"{parameter.median:.3g}",
+            "{:.3g} to {:.3g}".format(*parameter.interval) if parameter.inferred else "fixed",
         )
-        for subgoal in subgoals
+        for parameter in parameters
     ]
-    table = [_HEADINGS, *rows]
-    widths = [max(len(row[column]) for row in table) for column in range(len(_HEADINGS))]
+    return _aligned([("parameter", "median", "90 % interval"), *rows])
+
+
+def _aligned(table: Sequence[Sequence[str]]) -> str:
+    """The rows as lines, each column flush right and as wide as it has to be."""
+    widths = [max(len(text) for text in column) for column in zip(*table, strict=True)]
     return "\n".join(
         "  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True))
         for row in table
