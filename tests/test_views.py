@@ -203,6 +203,12 @@ def test_a_subgoal_heads_for_the_next_one_and_the_last_keeps_its_direction(summa
         assert yaw_in(arrows[rank].pose) == pytest.approx(yaw)
 
 
+def test_the_last_subgoal_of_a_loop_heads_for_the_first(summary):
+    # From (4, 0) on the map back to (0, 0).
+    loop = dataclasses.replace(summary, repetitions=2)
+    assert headings(loop) == pytest.approx({**headings(summary), 3: YAW - math.pi})
+
+
 def test_a_subgoal_alone_heads_along_x(summary):
     alone = dataclasses.replace(summary, subgoals=summary.subgoals[:1], visit_sequence=(1,))
     assert headings(alone) == {1: 0.0}

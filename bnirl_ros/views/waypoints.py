@@ -20,15 +20,22 @@ def subgoals_in_order(summary: Summary) -> tuple[Subgoal, ...]:
 def headings(summary: Summary) -> dict[int, float]:
     """Yaw [rad] in the map frame with which each rank is left for the next one visited.
 
-    The last one keeps the direction in which it was reached; a subgoal alone, or one that is not
-    in the visit sequence, heads along the x axis of the frame.
+    The last one keeps the direction in which it was reached, or heads for the first where the
+    visits go round; a subgoal alone, or one that is not in the visit sequence, heads along the x
+    axis of the frame.
     """
     order = subgoals_in_order(summary)
     yaw = dict.fromkeys((subgoal.rank for subgoal in summary.subgoals), 0.0)
     for here, there in pairwise(order):
-        (x, y), (next_x, next_y) = here.position, there.position
-        yaw[here.rank] = yaw[there.rank] = math.atan2(next_y - y, next_x - x)
+        yaw[here.rank] = yaw[there.rank] = _direction(here, there)
+    if summary.repetitions > 1:
+        yaw[order[-1].rank] = _direction(order[-1], order[0])
     return yaw
+
+
+def _direction(here: Subgoal, there: Subgoal) -> float:
+    (x, y), (next_x, next_y) = here.position, there.position
+    return math.atan2(next_y - y, next_x - x)
 
 
 def waypoint_path(summary: Summary, grid_map: GridMap, stamp_ns: int) -> Path:
