@@ -7,11 +7,12 @@ import json
 import math
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.text import Text
 from PIL import Image
 
 from bnirl_ros.inference.settings import Settings
@@ -27,6 +28,7 @@ from bnirl_ros.views.plot import draw_summary
 from bnirl_ros.views.results import subgoals_document, subgoals_in
 from bnirl_ros.views.tables import convergence, report, subgoal_table
 from bnirl_ros.views.waypoints import headings, waypoint_path
+from bnirl_ros.views.ways import MOST_NUMBERED, MOST_WAYS, route_of
 
 STAMP = 12_345_678_901
 YAW = math.pi / 2
@@ -126,6 +128,22 @@ def all_unexplained(summary: Summary) -> Summary:
         rank_of=np.zeros_like(summary.rank_of),
         pursuits=(),
         unexplained=1.0,
+    )
+
+
+def pursuing(summary: Summary, episodes: Mapping[int, Sequence[int]]) -> Summary:
+    """The same with pursuits of these ranks in each episode."""
+    pursuits = tuple(
+        Pursuit(episode, rank, first=0, last=0, arrived=True)
+        for episode, ranks in episodes.items()
+        for rank in ranks
+    )
+    first = [[episode, 0, 0, STAY] for episode in episodes]  # so that each has an observation
+    return dataclasses.replace(
+        summary,
+        pursuits=pursuits,
+        observations=np.array([*first, *summary.observations.tolist()]),
+        rank_of=np.array([*(1 for _ in first), *summary.rank_of]),
     )
 
 
@@ -408,6 +426,47 @@ def test_the_document_of_slips_alone_lists_episodes_without_pursuits(sequence, g
     assert "episodes" not in subgoals_document(nothing_found(grid_map), grid_map, Settings())
 
 
+def ways(summary: Summary) -> dict[tuple[int, int], tuple[int, tuple[int, ...]]]:
+    """How often each way was gone, and its numbers, by the ranks that it leads from and to."""
+    return {
+        (way.here.rank, way.there.rank): (way.times, way.numbers) for way in route_of(summary).ways
+    }
+
+
+def test_without_pursuits_the_route_is_the_order_of_the_first_visits(summary):
+    assert ways(summary) == {(2, 1): (1, (2,)), (1, 3): (1, (3,))}
+    assert route_of(summary).order == "order in which they were first visited"
+    assert not route_of(summary).wide
+
+
+def test_a_route_numbers_the_pursuits_of_an_episode_and_counts_those_of_all(summary):
+    episodes = {0: (3,), 1: (3, 1), 2: (1, 2, 1, 2, 3), 3: (), 4: (1, 2, 1, 2, 3)}
+    pursued = pursuing(summary, episodes)
+    assert ways(pursued) == {
+        (1, 2): (4, (2, 4)),
+        (2, 1): (2, (3,)),
+        (2, 3): (2, (5,)),
+        (3, 1): (1, ()),
+    }
+    route = route_of(pursued)
+    assert (route.order, route.most, route.wide) == ("order of the pursuits in episode 2", 4, True)
+
+
+def test_the_numbers_of_a_loop_are_those_of_the_visits(summary):
+    loop = pursuing(summary, {0: (2, 1, 3, 2, 1, 3, 2, 1)})
+    loop = dataclasses.replace(loop, repetitions=3)
+    assert ways(loop) == {(2, 1): (3, (2,)), (1, 3): (2, (3,)), (3, 2): (2, (1,))}
+    assert route_of(loop).order == "order of the pursuits, 3 times round"
+
+
+def test_no_way_leads_through_a_single_pursuit_or_none(sequence):
+    single = pursuing(sequence, {0: (1,), 1: (2,)})
+    again = pursuing(dataclasses.replace(sequence, visit_sequence=(1,)), {0: (1,), 1: (1,)})
+    for nowhere in (single, dataclasses.replace(again, repetitions=2), all_unexplained(sequence)):
+        assert route_of(nowhere).ways == ()
+        assert route_of(nowhere).most == 1
+
+
 # Matrices on linear RGB of Machado, Oliveira & Fernandes (2009), severity 1.
 VISION = {
     "normal": np.eye(3),
@@ -483,6 +542,16 @@ def as_bytes(colour: tuple[float, float, float]) -> tuple[int, int, int]:
     return red, green, blue
 
 
+def drawn_texts(summary: Summary, grid_map: GridMap, path: Path) -> list[str]:
+    """Everything that is written in a picture, which it draws."""
+    written = []
+    draw = Text.draw
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Text, "draw", lambda self, *rest: (written.append(self), draw(self, *rest)))
+        draw_summary(summary, grid_map, path)
+    return [text.get_text() for text in written]
+
+
 def test_the_picture_holds_every_subgoal_in_its_colour(tmp_path, summary, grid_map):
     path = tmp_path / "subgoals.png"
     draw_summary(summary, grid_map, path, title="A title")
@@ -499,7 +568,9 @@ def test_the_picture_shows_unexplained_observations_in_grey(tmp_path, summary, g
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 200), (200, 1), (300, 600)])
-def test_the_picture_suits_any_map(tmp_path, summary, shape):
+@pytest.mark.parametrize("pursued", [(), (1, 2, 1, 3)])
+def test_the_picture_suits_any_map(tmp_path, summary, shape, pursued):
+    summary = pursuing(summary, {0: pursued} if pursued else {})
     rows, columns = shape
     grid_map = GridMap(np.ones(shape, dtype=bool))
     subgoals = tuple(
@@ -513,7 +584,7 @@ def test_the_picture_suits_any_map(tmp_path, summary, shape):
         tmp_path / "subgoals.png",
     )
     width, height = Image.open(tmp_path / "subgoals.png").size
-    assert 600 < width < 1800
+    assert 600 < width < 1850
     assert 200 < height < 1800
 
 
@@ -527,6 +598,44 @@ def test_the_picture_without_a_subgoal_or_an_observation(tmp_path, summary, grid
     )
     draw_summary(nothing, grid_map, tmp_path / "subgoals.png")
     assert as_bytes(colour_of(2)) not in colours_in(tmp_path / "subgoals.png")
+
+
+@pytest.mark.parametrize("change", [all_unexplained, lambda each: each])
+def test_the_picture_tells_the_share_of_the_unexplained(tmp_path, sequence, grid_map, change):
+    shown = change(sequence)
+    texts = drawn_texts(shown, grid_map, tmp_path / "subgoals.png")
+    assert as_bytes(UNEXPLAINED) in colours_in(tmp_path / "subgoals.png")
+    assert f"explained by no subgoal: {100 * shown.unexplained:.3g} %" in texts
+    assert ("pursuits" in texts) == bool(shown.subgoals)
+
+
+def test_the_picture_numbers_pursuits_on_the_ways_between_their_subgoals(
+    tmp_path, summary, grid_map
+):
+    back_and_forth = pursuing(summary, {0: (1, 2, 1, 2, 1, 2, 1, 2, 3)})
+    texts = drawn_texts(back_and_forth, grid_map, tmp_path / "subgoals.png")
+    assert {"2, 4, 6, …", "3, 5, 7", "9", "order of the pursuits in episode 0"} <= set(texts)
+    assert "the wider, the more often" in texts
+    once = drawn_texts(pursuing(summary, {0: (1, 2)}), grid_map, tmp_path / "subgoals.png")
+    assert "the wider, the more often" not in once
+
+
+def test_the_picture_of_hundreds_of_pursuits(tmp_path, summary, grid_map):
+    cells = [(x, y) for y in range(3) for x in range(5) if grid_map.free[y, x]]
+    subgoals = tuple(
+        dataclasses.replace(summary.subgoals[0], rank=rank, cell=cell, pursuits=30.0)
+        for rank, cell in enumerate(cells, start=1)
+    )
+    rng = np.random.default_rng(0)
+    steps = rng.integers(1, len(cells), 400)
+    wandering = pursuing(
+        dataclasses.replace(summary, subgoals=subgoals),
+        {0: [int(each) + 1 for each in np.cumsum(steps) % len(cells)]},
+    )
+    route = route_of(wandering)
+    assert len(route.ways) == MOST_WAYS
+    texts = drawn_texts(wandering, grid_map, tmp_path / "subgoals.png")
+    assert f"order of the first {MOST_NUMBERED} pursuits in episode 0" in texts
 
 
 def test_the_same_summary_gives_the_same_picture(tmp_path, summary, grid_map):

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from bnirl_ros.inference.summary import Subgoal, Summary
+from bnirl_ros.inference.summary import Summary
 from bnirl_ros.maps import GridMap
 from bnirl_ros.mdp.actions import STEPS
 from bnirl_ros.views.colours import INK, UNEXPLAINED, Colour, colour_of
-from bnirl_ros.views.waypoints import subgoals_in_order
+from bnirl_ros.views.pursuits import unexplained_share
+from bnirl_ros.views.tables import subgoal_columns
+from bnirl_ros.views.ways import Route, Way, route_of
 
 _DOTS_PER_INCH = 144
 _POINTS_PER_INCH = 72
@@ -25,9 +26,12 @@ _LARGEST_CELL = 0.85  # Edge of a cell, so that tiny maps are drawn small [inch]
 _SHORTEST = 1.6  # Shorter side of the axes, unless the map would be stretched [inch].
 _LEFT, _BOTTOM = 0.65, 0.6  # Margins beside and below the axes [inch].
 _TOP, _TITLED_TOP = 0.2, 0.5  # Margin above them, without and with a title [inch].
-_LEGEND_WIDTH = 3.85  # Room right of the axes [inch].
+_LEGEND_LEFT = 0.47  # From the axes to the middle of the legend's signs [inch].
+_KEY = 0.34  # From there to what they mean [inch].
 _LEGEND_LINE = 0.235  # Height of one line of the legend [inch].
 _LARGEST_LEGEND = 24  # Subgoals that the legend lists.
+# Width of the columns that it has, after the ranks [inch].
+_COLUMNS = {"cell": 0.93, "probability": 0.8, "observations": 0.95, "pursuits": 0.65, "order": 0.5}
 
 _BLOCKED: Colour = (0.25, 0.28, 0.33)
 _FREE: Colour = (1.0, 1.0, 1.0)
@@ -36,6 +40,8 @@ _ROUTE: Colour = (0.35, 0.38, 0.43)
 
 _ARROWS_FROM = 9.0  # Cells of this edge have room for arrows; smaller ones get dots [pt].
 _SMALLEST_DOT = 2.6  # Diameter [pt].
+_MOST_NUMBERS = 3  # Numbers on one way.
+_NUMBER = 11.0  # Height of a number's box, and its width unless it is longer [pt].
 
 # An arrow along x from (0, 0) to (1, 0): (along, across as a share of its width) of each corner.
 _ARROW = np.array(
@@ -47,7 +53,7 @@ _ARROW = np.array(
 class _Layout:
     """Sizes of the picture: figure, axes and top margin [inch], a cell's edge on paper [pt].
 
-    `bend` is how far the way from one subgoal to the next bows, as a share of its length.
+    `bend` is how far the way from one subgoal to the next may bow, as a share of its length.
     """
 
     figure: tuple[float, float]
@@ -55,6 +61,15 @@ class _Layout:
     top: float
     cell: float
     bend: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Number:
+    """The numbers of a way: text, place (x, y) [cells], width and height of its box [pt]."""
+
+    text: str
+    place: npt.NDArray[np.float64]
+    box: npt.NDArray[np.float64]
 
 
 def import_matplotlib() -> tuple[Any, Any]:
@@ -77,8 +92,9 @@ def draw_summary(
     Shown are the map (blocked cells dark); each distinct (cell, action) pair of the observations,
     as an arrow along the action or a dot for staying, coloured by the subgoal to which the mode
     assigns it and the wider the more often it occurs (on maps too fine for arrows, a dot); the
-    subgoals with their rank, with their probability beside it; and the order in which they were
-    first visited, as arrows from one to the next. Axes are in cells.
+    subgoals with their rank, with their probability beside it; and the ways from one to the next
+    as arrows, numbered in order (see `route_of`) and the wider the more often they were gone. Axes
+    are in cells.
 
     Args:
         summary: the posterior.
@@ -90,7 +106,14 @@ def draw_summary(
         OSError: the file cannot be written.
     """
     figure_class, canvas_class = import_matplotlib()
-    layout = _layout(grid_map, len(summary.subgoals), _TOP if title is None else _TITLED_TOP)
+    route = route_of(summary)
+    table = subgoal_columns(summary.subgoals[:_LARGEST_LEGEND], summary.visit_sequence)
+    columns = {name: texts for name, texts in table.items() if name in _COLUMNS}
+    legend = (
+        _LEGEND_LEFT + sum(_COLUMNS[name] for name in columns) + 0.2,
+        _LEGEND_LINE * (len(columns["cell"]) + 5 + route.wide),
+    )
+    layout = _layout(grid_map, legend, _TOP if title is None else _TITLED_TOP)
     width, height = layout.figure
     figure = figure_class(figsize=layout.figure, dpi=_DOTS_PER_INCH, facecolor="white")
     canvas = canvas_class(figure)
@@ -104,9 +127,10 @@ def draw_summary(
     )
     _draw_map(axes, grid_map, layout)
     _draw_observations(axes, summary, layout)
-    _draw_route(axes, summary, layout)
-    _draw_subgoals(axes, summary, layout)
-    _draw_legend(figure, summary, layout)
+    numbers = _number_places(summary, route, layout)
+    _draw_route(axes, route, numbers, layout)
+    _draw_subgoals(axes, summary, numbers, layout)
+    _draw_legend(figure, summary, route, columns, layout)
     if title is not None:
         figure.text(
             _LEFT / width,
@@ -121,17 +145,14 @@ def draw_summary(
         canvas.print_png(file, metadata={"Software": None}, pil_kwargs={"compress_level": 2})
 
 
-def _layout(grid_map: GridMap, subgoals: int, top: float) -> _Layout:
+def _layout(grid_map: GridMap, legend: tuple[float, float], top: float) -> _Layout:
+    """The layout for a map, beside it a legend of some width and height [inch]."""
     rows, columns = grid_map.free.shape
     # A longish map is as long as there is room, a square one smaller: about the same area.
     longest = _LONGEST * min(1.0, 0.78 * math.sqrt(max(rows, columns) / min(rows, columns)))
     inches = min(longest / max(rows, columns), _LARGEST_CELL)
     axes = (max(columns * inches, _SHORTEST), max(rows * inches, _SHORTEST))
-    legend = _LEGEND_LINE * (min(subgoals, _LARGEST_LEGEND) + 5)
-    figure = (
-        _LEFT + axes[0] + _LEGEND_WIDTH,
-        top + max(axes[1] + _BOTTOM, legend),
-    )
+    figure = (_LEFT + axes[0] + legend[0], top + max(axes[1] + _BOTTOM, legend[1]))
     # Ways bow aside of what was walked, but along a corridor not out of the map.
     bend = 0.14 * min(1.0, 2.5 * min(rows, columns) / max(rows, columns))
     return _Layout(figure, axes, top, inches * _POINTS_PER_INCH, bend)
@@ -172,7 +193,8 @@ def _draw_observations(axes: Any, summary: Summary, layout: _Layout) -> None:
     steps = STEPS[distinct[:, 2]]
     if layout.cell < _ARROWS_FROM:
         diameter = max(_SMALLEST_DOT, 0.8 * layout.cell)
-        seen_last = np.argsort(counts, kind="stable")  # The most frequent one lies on top.
+        # What is explained lies on top, and there the most frequent one.
+        seen_last = np.lexsort((counts, distinct[:, 3] > 0))
         axes.scatter(
             *distinct[seen_last, :2].T,
             s=diameter**2,
@@ -235,50 +257,117 @@ def _arrows(
     )
 
 
-def _draw_route(axes: Any, summary: Summary, layout: _Layout) -> None:
+def _draw_route(axes: Any, route: Route, numbers: Sequence[_Number], layout: _Layout) -> None:
     from matplotlib.patches import FancyArrowPatch
     from matplotlib.patheffects import withStroke
 
-    order = subgoals_in_order(summary)
-    opacity = max(0.35, min(1.0, 8 / max(len(order), 1)))  # Many ways must not hide the map.
-    for number, (here, there) in enumerate(pairwise(order), start=2):
+    opacity = max(0.35, min(1.0, 8 / (len(numbers) + 1)))  # Many ways must not hide the map.
+    for way in route.ways:
+        width = max(_widest(route) * way.times / route.most, 0.8)
         axes.add_patch(
             FancyArrowPatch(
-                here.cell,
-                there.cell,
-                connectionstyle=f"arc3,rad={layout.bend}",
+                way.here.cell,
+                way.there.cell,
+                connectionstyle=f"arc3,rad={_bend(way, layout)}",
                 arrowstyle="-|>,head_length=5,head_width=2.6",
                 shrinkA=_marker(layout) / 2 + 1,
                 shrinkB=_marker(layout) / 2 + 2,
-                linewidth=1.3,
+                linewidth=width,
                 linestyle=(0, (4, 2)),
                 color=_ROUTE,
                 alpha=opacity,
-                path_effects=[withStroke(linewidth=3, foreground="white", alpha=0.6 * opacity)],
+                path_effects=[
+                    withStroke(linewidth=width + 1.7, foreground="white", alpha=0.6 * opacity)
+                ],
                 zorder=4,
             )
         )
-        _write_order(axes, _middle_of_way(here, there, layout), number)
+    for number in numbers:
+        _write_order(axes, number.place, number.text)
 
 
-def _middle_of_way(here: Subgoal, there: Subgoal, layout: _Layout) -> npt.NDArray[np.float64]:
-    """The place (x, y) [cells] halfway along the bowed way between two subgoals."""
-    start, end = np.array(here.cell), np.array(there.cell)
-    right, up = end - start
-    return np.asarray((start + end + layout.bend * np.array([up, -right])) / 2)
+def _widest(route: Route) -> float:
+    """Width of the most frequent way [pt]."""
+    return min(1.3 * math.sqrt(route.most), 4.0)
 
 
-def _write_order(axes: Any, place: npt.NDArray[np.float64], number: int) -> None:
-    """The number of a way: the place in the visit sequence to which it leads."""
+def _span(way: Way) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """The vector [cells] from one end of a way to the other, and one as long to its right."""
+    along = np.subtract(way.there.cell, way.here.cell, dtype=np.float64)
+    return along, np.array([along[1], -along[0]])
+
+
+def _bend(way: Way, layout: _Layout) -> float:
+    """How far a way bows to its right, as a share of its length: at most to the map's edge."""
+    along, aside = _span(way)
+    frame = np.array(layout.axes) * _POINTS_PER_INCH
+    middle = _on_paper(way.here.cell + along / 2, layout)
+    room = np.where(aside > 0, frame - middle, middle) - _NUMBER
+    bow = np.abs(aside) * layout.cell / 2  # Half of the control point's distance.
+    reach = np.divide(room, bow, out=np.full(2, np.inf), where=bow > 0)
+    return float(np.clip(reach.min(), 0.0, layout.bend))
+
+
+def _number_places(summary: Summary, route: Route, layout: _Layout) -> list[_Number]:
+    """The numbers of the ways: halfway, or where they cover less of markers and other numbers.
+
+    They lie on their way, but beside it where there is a way back: it may be as close as that.
+    """
+    size = _marker(layout)
+    taken = [
+        (_on_paper(subgoal.cell, layout), np.array([size, size])) for subgoal in summary.subgoals
+    ]
+    pairs = {(way.here.rank, way.there.rank) for way in route.ways}
+    numbers = []
+    for way in route.ways:
+        if not way.numbers:
+            continue
+        text = ", ".join(map(str, way.numbers[:_MOST_NUMBERS]))
+        text += ", …" if len(way.numbers) > _MOST_NUMBERS else ""
+        box = np.array([_NUMBER + 4.0 * max(len(text) - 2, 0), _NUMBER])
+        along, aside = _span(way)
+        bow = _bend(way, layout) * aside
+        start = np.array(way.here.cell, dtype=np.float64)
+        if (way.there.rank, way.here.rank) in pairs:
+            start += (box / 2 + 2) * aside / max(math.hypot(*aside), 1.0) / layout.cell
+        places = [
+            start + share * along + 2 * share * (1 - share) * bow
+            for share in (0.5, 0.6, 0.4, 0.7, 0.3)
+        ]
+        costs = [_overlap(_on_paper(place, layout), box, taken) for place in places]
+        best = places[int(np.argmin(costs))]
+        taken.append((_on_paper(best, layout), box))
+        numbers.append(_Number(text, best, box))
+    return numbers
+
+
+def _on_paper(cell: npt.ArrayLike, layout: _Layout) -> npt.NDArray[np.float64]:
+    """A place (x, y) [cells] as one right and up of the map's corner [pt]."""
+    return (np.asarray(cell, dtype=np.float64) + 0.5) * layout.cell
+
+
+def _overlap(
+    centre: npt.NDArray[np.float64],
+    box: npt.NDArray[np.float64],
+    taken: Sequence[tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]],
+) -> float:
+    """How much [pt^2] of a box, of some width and height, lies on others, each with its centre."""
+    apart = np.abs([centre - other for other, _ in taken])
+    sides = np.clip([(box + size) / 2 for _, size in taken] - apart, 0.0, None)
+    return float(sides.prod(axis=1).sum())
+
+
+def _write_order(axes: Any, place: npt.NDArray[np.float64], text: str) -> None:
+    """The numbers of a way: the places in the order to which it leads."""
     axes.text(
         *place,
-        str(number),
+        text,
         fontsize=7,
         color=_ROUTE,
         horizontalalignment="center",
         verticalalignment="center_baseline",
         bbox={
-            "boxstyle": "circle,pad=0.18",
+            "boxstyle": "circle,pad=0.18" if len(text) < 3 else "round,pad=0.18,rounding_size=0.6",
             "facecolor": "white",
             "edgecolor": _ROUTE,
             "linewidth": 0.7,
@@ -292,11 +381,13 @@ def _marker(layout: _Layout) -> float:
     return min(max(0.5 * layout.cell, 15.0), 22.0)
 
 
-def _draw_subgoals(axes: Any, summary: Summary, layout: _Layout) -> None:
+def _draw_subgoals(
+    axes: Any, summary: Summary, numbers: Sequence[_Number], layout: _Layout
+) -> None:
     from matplotlib.patheffects import withStroke
 
     size = _marker(layout)
-    tags = _tag_places(summary, layout, size)
+    tags = _tag_places(summary, numbers, layout, size)
     for subgoal, (right, up) in zip(summary.subgoals, tags, strict=True):
         colour = colour_of(subgoal.rank)
         axes.plot(
@@ -340,22 +431,19 @@ def _writing_on(colour: Colour) -> Colour:
     return (1.0, 1.0, 1.0) if luminance < 0.26 else INK
 
 
-def _tag_places(summary: Summary, layout: _Layout, size: float) -> Iterator[tuple[float, float]]:
+def _tag_places(
+    summary: Summary, numbers: Sequence[_Number], layout: _Layout, size: float
+) -> Iterator[tuple[float, float]]:
     """Where each subgoal's probability goes, right and up of its centre [pt].
 
     Each takes the first of eight places around its marker where it covers least of the markers,
     of the numbers of the ways and of the probabilities placed before it, within the axes.
     """
-    width, height, number = 24.0, 11.0, 11.0
+    width, height = 24.0, 11.0
     frame = np.array(layout.axes) * _POINTS_PER_INCH
-
-    def on_paper(cell: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        return (np.asarray(cell, dtype=np.float64) + 0.5) * layout.cell
-
-    centres = [on_paper(subgoal.cell) for subgoal in summary.subgoals]
+    centres = [_on_paper(subgoal.cell, layout) for subgoal in summary.subgoals]
     taken = [(centre, np.array([size, size])) for centre in centres]
-    for here, there in pairwise(subgoals_in_order(summary)):
-        taken.append((on_paper(_middle_of_way(here, there, layout)), np.array([number, number])))
+    taken += [(_on_paper(number.place, layout), number.box) for number in numbers]
     aside, above = (size + width) / 2 + 1, (size + height) / 2 + 1
     places = np.array(
         [(0, above), (0, -above), (aside, 0), (-aside, 0)]
@@ -365,27 +453,26 @@ def _tag_places(summary: Summary, layout: _Layout, size: float) -> Iterator[tupl
     for centre in centres:
         costs = []
         for place in places:
-            apart = np.abs([centre + place - other for other, _ in taken])
-            overlap = np.clip([(box + b) / 2 for _, b in taken] - apart, 0.0, None).prod(axis=1)
             low, high = centre + place - box / 2, centre + place + box / 2
             outside = np.clip(-low, 0.0, None).sum() + np.clip(high - frame, 0.0, None).sum()
-            costs.append(overlap.sum() + 100.0 * outside)
+            costs.append(_overlap(centre + place, box, taken) + 100.0 * outside)
         best = places[int(np.argmin(costs))]
         taken.append((centre + best, box))
         yield float(best[0]), float(best[1])
 
 
-def _draw_legend(figure: Any, summary: Summary, layout: _Layout) -> None:
+def _draw_legend(
+    figure: Any, summary: Summary, route: Route, columns: dict[str, list[str]], layout: _Layout
+) -> None:
     """The table of the subgoals and the key of the signs, right of the axes."""
     width, height = layout.figure
     legend = figure.add_axes((0, 0, 1, 1))
     legend.set_axis_off()
     legend.set_xlim(0, width)
     legend.set_ylim(height, 0)
-    left = _LEFT + layout.axes[0] + 0.35
-    columns = (left + 0.12, left + 1.05, left + 1.85, left + 2.8, left + 3.3)
+    sign = _LEFT + layout.axes[0] + _LEGEND_LEFT
 
-    def write(x: float, y: float, text: str, faint: bool = False, right: bool = True) -> None:
+    def write(x: float, y: float, text: str, faint: bool = True, right: bool = False) -> None:
         legend.text(
             x,
             y,
@@ -396,17 +483,22 @@ def _draw_legend(figure: Any, summary: Summary, layout: _Layout) -> None:
             verticalalignment="center_baseline",
         )
 
+    def dot(y: float, colour: Colour, size: float) -> None:
+        legend.plot(sign, y, marker="o", markersize=size, color=colour, markeredgewidth=0)
+
     y = layout.top + 0.1
-    names = ("cell", "probability", "observations", "order")
-    for x, name in zip(columns[1:], names, strict=True):
-        write(x, y, name, faint=True)
-    order = {rank: position for position, rank in enumerate(summary.visit_sequence, start=1)}
+    x = sign
+    for name, texts in columns.items():
+        x += _COLUMNS[name]
+        write(x, y, name, right=True)
+        for line, text in enumerate(texts, start=1):
+            write(x, y + line * _LEGEND_LINE, text, faint=False, right=True)
     for subgoal in summary.subgoals[:_LARGEST_LEGEND]:
         y += _LEGEND_LINE
         colour = colour_of(subgoal.rank)
-        legend.plot(columns[0], y, marker="o", markersize=13, color=colour, markeredgewidth=0)
+        dot(y, colour, 13)
         legend.text(
-            columns[0],
+            sign,
             y,
             str(subgoal.rank),
             fontsize=7.5,
@@ -415,40 +507,35 @@ def _draw_legend(figure: Any, summary: Summary, layout: _Layout) -> None:
             horizontalalignment="center",
             verticalalignment="center_baseline",
         )
-        texts = (
-            "({}, {})".format(*subgoal.cell),
-            f"{subgoal.probability:.2f}",
-            str(subgoal.observations),
-            str(order.get(subgoal.rank, "-")),
-        )
-        for x, text in zip(columns[1:], texts, strict=True):
-            write(x, y, text)
     if len(summary.subgoals) > _LARGEST_LEGEND:
         y += _LEGEND_LINE
         more = len(summary.subgoals) - _LARGEST_LEGEND
-        write(left, y, f"and {more} more", faint=True, right=False)
+        write(sign - 0.12, y, f"and {more} more")
     y += 1.6 * _LEGEND_LINE
-    key = columns[0] + 0.34
-    if len(summary.visit_sequence) > 1:
+    if route.ways:
         legend.annotate(
             "",
-            xy=(columns[0] + 0.22, y),
-            xytext=(columns[0] - 0.22, y),
+            xy=(sign + 0.22, y),
+            xytext=(sign - 0.22, y),
             arrowprops={
                 "arrowstyle": "-|>,head_length=0.35,head_width=0.2",
                 "color": _ROUTE,
                 "linewidth": 1.3,
             },
         )
-        _write_order(legend, np.array([columns[0] - 0.04, y]), 2)
-        write(key, y, "order in which they were first visited", faint=True, right=False)
+        _write_order(legend, np.array([sign - 0.04, y]), "2")
+        write(sign + _KEY, y, route.order)
         y += _LEGEND_LINE
-    legend.plot(columns[0], y, marker="o", markersize=4, color=colour_of(1), markeredgewidth=0)
-    write(key, y, _key_of_observations(layout), faint=True, right=False)
+    if route.wide:
+        legend.plot([sign - 0.2, sign + 0.2], [y, y], color=_ROUTE, linewidth=_widest(route))
+        write(sign + _KEY, y, "the wider, the more often")
+        y += _LEGEND_LINE
+    dot(y, colour_of(1), 4)
+    write(sign + _KEY, y, _key_of_observations(layout))
     if (summary.rank_of == 0).any():
         y += _LEGEND_LINE
-        legend.plot(columns[0], y, marker="o", markersize=4, color=UNEXPLAINED, markeredgewidth=0)
-        write(key, y, "explained by no subgoal", faint=True, right=False)
+        dot(y, UNEXPLAINED, 4)
+        write(sign + _KEY, y, f"explained by no subgoal: {unexplained_share(summary)}")
 
 
 def _key_of_observations(layout: _Layout) -> str:
