@@ -36,7 +36,7 @@ from bnirl_ros.experiments.scenarios import (
 )
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.maps import GridMap
-from bnirl_ros.mdp.actions import ACTION_NAMES
+from bnirl_ros.mdp.actions import ACTION_NAMES, STEPS
 from bnirl_ros.mdp.goal_values import goal_values
 
 BAGS = Path(__file__).resolve().parents[1] / "bags"
@@ -71,6 +71,22 @@ episode,t,x,y,action,interact_ok
 4,2,2,1,I,1
 5,0,2,2,.,0
 5,1,2,2,W,0
+"""
+PLAY = """\
+episode,t,x,y,action
+4,0,1,1,N
+4,1,1,1,E
+4,2,2,1,I
+4,3,2,1,.
+4,4,2,1,E
+4,5,2,1,S
+4,6,2,2,I
+5,0,2,2,N
+5,1,2,1,W
+6,0,2,1,.
+6,1,2,1,E
+7,1,2,1,.
+7,0,2,1,I
 """
 LAYOUT = "XXXX\nX  X\nXX X\nXXXX\n"
 
@@ -270,30 +286,40 @@ def test_as_many_whole_episodes_as_fit_are_taken(tmp_path: Path) -> None:
 
 
 def test_recorded_play_becomes_a_demonstration(tmp_path: Path) -> None:
-    demonstration, grid_map = overcooked.read_overcooked(recordings(tmp_path), "tiny")
+    demonstration, grid_map = overcooked.read_overcooked(recordings(tmp_path, PLAY), "tiny")
     assert grid_map.free.tolist() == [
         [False, False, False, False],
         [False, False, True, False],
         [False, True, True, False],
         [False, False, False, False],
     ]
+    # Left out are the steps without an action, the pushes N and E in episode 4 and E in 6, and W
+    # in 5, as nothing shows whether it moved the player.
     names = [ACTION_NAMES[action] for action in demonstration.action]
-    assert names == ["N", "E", "stay", "stay", "W"]
-    assert demonstration.episode.tolist() == [4, 4, 4, 5, 5]
-    assert demonstration.cells.tolist() == [[1, 2], [1, 2], [2, 2], [2, 1], [2, 1]]
-    assert len(demonstration.last_cells) == 0
+    assert names == ["E", "stay", "S", "stay", "N", "stay"]
+    assert demonstration.episode.tolist() == [4, 4, 4, 4, 5, 7]
+    assert demonstration.cells.tolist() == [[1, 2], [2, 2], [2, 2], [2, 1], [2, 1], [2, 2]]
+    # Episode 4 ends with an observation, and 6 has none.
+    assert demonstration.last_episode.tolist() == [5, 7]
+    assert demonstration.last_cells.tolist() == [[2, 2], [2, 2]]
+
+
+def test_paths_hold_every_step(tmp_path: Path) -> None:
+    paths = overcooked.read_paths(recordings(tmp_path, PLAY), "tiny")
+    assert paths[:, 0].tolist() == [4] * 7 + [5] * 2 + [6] * 2 + [7] * 2
+    assert paths[:3, 1:].tolist() == [[1, 2], [1, 2], [2, 2]]
 
 
 @needs_recordings
-@pytest.mark.parametrize("layout", make_bags.LAYOUTS)
+@pytest.mark.parametrize("layout", overcooked.LAYOUTS)
 def test_recorded_moves_lead_where_they_point(layout: str) -> None:
     demonstration, grid_map = overcooked.read_overcooked(RECORDINGS, layout)
-    steps = np.diff(demonstration.cells, axis=0)[np.diff(demonstration.episode) == 0]
-    moved = steps.any(axis=1)
-    actions = demonstration.action[:-1][np.diff(demonstration.episode) == 0][moved]
-    named = {"E": [1, 0], "N": [0, 1], "W": [-1, 0], "S": [0, -1]}
-    assert [named[ACTION_NAMES[action]] for action in actions] == steps[moved].tolist()
-    assert grid_map.is_free(demonstration.cells).all()
+    within = np.diff(demonstration.episode) == 0
+    led_to = demonstration.cells[:-1] + STEPS[demonstration.action[:-1]]
+    np.testing.assert_array_equal(led_to[within], demonstration.cells[1:][within])
+    # Nobody is pushing: moves into furniture are left out.
+    moves = demonstration.action[:-1] != ACTION_NAMES.index("stay")
+    assert grid_map.is_free(led_to[moves & within]).all()
 
 
 @pytest.mark.parametrize(
@@ -308,6 +334,7 @@ def test_recorded_moves_lead_where_they_point(layout: str) -> None:
         (CSV + "5,2,0,2,N,0\n", LAYOUT, r"line 7: \(x, y\) = \(0, 2\) is no floor of the layout"),
         (CSV + "5,2,2,9,N,0\n", LAYOUT, r"line 7: \(x, y\) = \(2, 9\) is no floor of the layout"),
         (CSV + "5,3,2,2,N,0\n", LAYOUT, r"tiny.csv: episode 5 breaks off after t = 1; "),
+        (CSV.replace(",I,", ",.,").replace(",E,", ",.,"), LAYOUT, "nobody moves or interacts; "),
         (CSV, "XX\nX\n", r"tiny.grid.txt: its lines differ in length; "),
         (CSV, "XX\nXX\n", r"tiny.grid.txt: has no floor; "),
         (CSV, "", r"tiny.grid.txt: has no floor; "),

@@ -3,6 +3,13 @@
 The recordings are two text files for each layout, `<layout>.csv` and `<layout>.grid.txt`, taken
 from the train split of the human-human trials in the PyPI package overcooked-ai 1.1.0. Each
 episode is one player of one trial.
+
+How a step of the game is read, by one rule for all layouts: a move that changed the player's cell
+is an observation, and an interaction is one of staying. Steps without an action and pushes that
+moved nobody, against furniture or the other player, are none: people stand about a great deal,
+waiting for soup or for each other, and a push is how a player turns to what it faces. A push shows
+by the cell of the next step. So the last step of an episode, which has no next one, is an
+observation only where it is an interaction; otherwise its cell is the last pose.
 """
 
 from __future__ import annotations
@@ -18,14 +25,20 @@ from bnirl_ros.errors import InputError
 from bnirl_ros.maps import GridMap
 from bnirl_ros.mdp.actions import ACTION_NAMES
 
+LAYOUTS = ("random3", "asymmetric_advantages", "coordination_ring")
+"""Layouts whose human play the project measures itself against."""
+
 STEP = 0.15
-"""Time between two actions of a player [s]."""
+"""Time between two poses in a bag [s]: a step of the game. As no pose is there for the steps that
+are left out, the time that a player waits is not in the bag."""
 
 LICENCE = """\
 This bag was converted from human play recorded with Overcooked-AI
 (https://github.com/HumanCompatibleAI/overcooked_ai): the train split of the human-human trials in
-its release 1.1.0. Positions and actions of the players were kept, an interaction became staying in
-place; the layout became the map, its floor free and its furniture blocked.
+its release 1.1.0. Of the players' steps those were kept in which a move changed the player's cell,
+and those in which the player interacted, which became staying in place. Steps without an action
+and moves that were blocked were left out, and the steps that were kept were spaced evenly in time.
+The layout became the map, its floor free and its furniture blocked.
 
 Overcooked-AI is under the MIT License:
 
@@ -63,8 +76,9 @@ FLOOR = " "
 
 # Interacting leaves the player in its cell, as staying does. N is up on the screen, and our y is
 # up as well: the names need no turning round, only the rows do.
-_ACTION_NAMES = {"N": "N", "S": "S", "E": "E", "W": "W", ".": "stay", "I": "stay"}
-_ACTIONS = {code: ACTION_NAMES.index(name) for code, name in _ACTION_NAMES.items()}
+_ACTION_NAMES = {"N": "N", "S": "S", "E": "E", "W": "W", "I": "stay"}
+_IDLE = -1  # in an action's place: the player pressed nothing
+_ACTIONS = {".": _IDLE} | {code: ACTION_NAMES.index(name) for code, name in _ACTION_NAMES.items()}
 
 _GET_THEM = (
     "it must hold <layout>.csv with the columns episode,t,x,y,action and <layout>.grid.txt, "
@@ -76,17 +90,31 @@ def read_overcooked(folder: Path, layout: str) -> tuple[Demonstration, GridMap]:
     """The demonstration and the map in `<layout>.csv` and `<layout>.grid.txt` of a folder.
 
     The map has the layout's floor free and all else blocked, cells of 1 m, and the frame `map`.
-    The files' rows count from the top, our y from the bottom.
+    The files' rows count from the top, our y from the bottom. Which steps are observations, the
+    module's docstring says.
 
     Raises:
         InputError: a file is missing or no such recording; the sentence names file and line.
     """
-    if not folder.is_dir():
-        raise InputError(f"{folder}: there is no such folder; {_GET_THEM}")
-    grid_map = _read_layout(folder / f"{layout}.grid.txt")
-    path = folder / f"{layout}.csv"
-    rows = _read_rows(path, grid_map)
-    return _demonstration(rows, path), grid_map
+    rows, grid_map = _read_recording(folder, layout)
+    demonstration = _demonstration(rows)
+    if not len(demonstration):
+        raise InputError(
+            f"{folder / f'{layout}.csv'}: nobody moves or interacts; record players at play"
+        )
+    return demonstration, grid_map
+
+
+def read_paths(folder: Path, layout: str) -> npt.NDArray[np.int64]:
+    """Episode and cell (N, 3) at every step of the recording, whatever the player did in it.
+
+    In order of episode and time, y up.
+
+    Raises:
+        InputError: as in `read_overcooked`.
+    """
+    rows, _ = _read_recording(folder, layout)
+    return rows[:, [0, 2, 3]]
 
 
 def read_interactions(folder: Path, layout: str) -> npt.NDArray[np.int64]:
@@ -134,8 +162,17 @@ def _read_layout(path: Path) -> GridMap:
     return GridMap(free)
 
 
+def _read_recording(folder: Path, layout: str) -> tuple[npt.NDArray[np.int64], GridMap]:
+    """Every step (N, 5) as in `_read_rows`, by episode and time without a gap, and the map."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: there is no such folder; {_GET_THEM}")
+    grid_map = _read_layout(folder / f"{layout}.grid.txt")
+    path = folder / f"{layout}.csv"
+    return _in_steps(_read_rows(path, grid_map), path), grid_map
+
+
 def _read_rows(path: Path, grid_map: GridMap) -> npt.NDArray[np.int64]:
-    """(N, 5) episode, t, x, y (up) and action index of each row of the CSV, in its order."""
+    """(N, 5) episode, t, x, y (up) and action index, or `_IDLE`, of each row of the CSV."""
     reader = csv.DictReader(_read_text(path).splitlines())
     missing = [column for column in COLUMNS if column not in (reader.fieldnames or ())]
     if missing:
@@ -152,7 +189,7 @@ def _read_rows(path: Path, grid_map: GridMap) -> npt.NDArray[np.int64]:
 def _observation(
     row: dict[str, str | None], place: str, grid_map: GridMap
 ) -> tuple[int, int, int, int, int]:
-    """Episode, t, x, y (up) and action index of a row; `place` is for the error's sentence."""
+    """Episode, t, x, y (up), action index or `_IDLE` of a row; `place` is for an error."""
     height, width = grid_map.free.shape
     try:
         episode, time, x, from_top = (int(row[column] or "") for column in COLUMNS[:4])
@@ -174,8 +211,8 @@ def _observation(
     return episode, time, x, y, action
 
 
-def _demonstration(rows: npt.NDArray[np.int64], path: Path) -> Demonstration:
-    """The demonstration in rows (N, 5), which must be steps without a gap in every episode."""
+def _in_steps(rows: npt.NDArray[np.int64], path: Path) -> npt.NDArray[np.int64]:
+    """The rows (N, 5) by episode and time, which must be steps without a gap in every episode."""
     rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
     change = np.diff(rows, axis=0)
     is_step = (change[:, 1] == 1) & (np.abs(change[:, 2:4]).max(axis=1, initial=0) <= 1)
@@ -186,10 +223,21 @@ def _demonstration(rows: npt.NDArray[np.int64], path: Path) -> Demonstration:
             f"{path}: episode {episode} breaks off after t = {time}; t must count up by one and "
             "the player must move by one cell at most"
         )
+    return rows
+
+
+def _demonstration(rows: npt.NDArray[np.int64]) -> Demonstration:
+    """The observations and last poses in steps (N, 5), by the rule of the module's docstring."""
+    episode, cells, action = rows[:, 0], rows[:, 2:4], rows[:, 4]
+    last = np.diff(episode, append=episode[-1] + 1) != 0
+    moved = np.diff(cells, axis=0, append=cells[-1:]).any(axis=1) & ~last
+    interacted = action == ACTION_NAMES.index("stay")
+    observed = interacted | (moved & (action != _IDLE))
+    ends = last & ~observed & np.isin(episode, episode[observed])
     return Demonstration(
-        episode=rows[:, 0],
-        cells=rows[:, 2:4],
-        action=rows[:, 4],
-        last_episode=np.empty(0, dtype=np.int64),
-        last_cells=np.empty((0, 2), dtype=np.int64),
+        episode=episode[observed],
+        cells=cells[observed],
+        action=action[observed],
+        last_episode=episode[ends],
+        last_cells=cells[ends],
     )
