@@ -148,7 +148,7 @@ def _infer(options: argparse.Namespace) -> int:
     from bnirl_ros.inference.summary import summarise
     from bnirl_ros.views.plot import import_matplotlib
     from bnirl_ros.views.results import check_writable, write_results
-    from bnirl_ros.views.tables import convergence, subgoal_table
+    from bnirl_ros.views.tables import report
 
     demonstration, grid_map, damage = _read(options, settings, remappings)
     check_writable(options.out)
@@ -158,8 +158,7 @@ def _infer(options: argparse.Namespace) -> int:
         posterior = infer(demonstration, grid_map, settings, progress)
     summary = summarise(posterior, grid_map)
     written = write_results(options.out, posterior, summary, grid_map, settings)
-    print(subgoal_table(summary.subgoals, summary.visit_sequence))
-    print(convergence(summary))
+    print(report(summary))
     print(f"Written: {', '.join(str(file) for file in written)}")
     if damage:
         raise InputError(f"{damage}; the results are from what could be read")
