@@ -10,8 +10,8 @@ A sweep draws, each given all else:
    O(G), not O(G^2). Blocks differ in length from sweep to sweep;
 2. partitions, given the subgoals, by the Chinese restaurant process that the urn collapses, and
    the subgoal of each partition anew: whole groups of pursuits move at once;
-3. which actions are slips, and the parameters: beta ones from their conditionals, log-normal ones
-   by slice sampling.
+3. the parameters: switch probabilities from their conditionals, the others by slice sampling.
+   Which actions are slips stays open throughout, and is drawn for the record.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ from bnirl_ros.model.pursuits import PRIORS, PursuitModel
 _SHORTEST_BLOCK, _LONGEST_BLOCK = 8, 1024  # observations; their logarithm is uniform
 _BLOCK_ENTRIES = 4_000_000  # of the forward messages: shorter blocks where candidates are many
 _SLICE = 0.7  # first width of a slice, of a logarithm
-_CONFIDENCE_PERIOD = 4  # sweeps between two draws of alpha, for which all likelihoods change
+_CONFIDENCE_PERIOD = 4  # sweeps between two draws of alpha, where those cost more than the rest
+_RAREST = 1e-12  # probabilities stay off 0 and 1, which would rule out what is only improbable
 
 # Columns of the parameters, in the order of `PRIORS`.
 ALPHA, ETA, SLIP, ON_ARRIVAL, AT_SUBGOAL, ELSEWHERE = range(len(PRIORS))
@@ -224,18 +225,21 @@ def _advance(model, state, generator, thin, subgoal_of, partition_of, log_joint,
     forward = np.empty((longest, candidates))
     chosen = softmax_table(model, state.parameters[ALPHA])
     label = np.empty(state.subgoal_of.shape[0], dtype=np.int32)
+    # A draw of alpha takes a new table, an exponential for each of its states and actions.
+    states, actions = model.cost.shape[:2]
+    period = 1 if states * actions <= label.shape[0] else _CONFIDENCE_PERIOD
     for draw in range(log_joint.shape[0]):
         for _ in range(thin):
             _draw_blocks(model, state, chosen, forward, generator)
             _draw_groups(model, state, chosen, generator)
-            _draw_slips(model, state, chosen, generator)
-            _draw_probabilities(model, state, generator)
-            if not model.is_fixed[ETA]:
-                _draw_concentration(model, state, generator)
-            if state.sweeps[0] % _CONFIDENCE_PERIOD == 0 and not model.is_fixed[ALPHA]:
-                _draw_confidence(model, state, generator)
+            _draw_switch_probabilities(model, state, generator)
+            _draw_concentration(model, state, generator)
+            confidence_too = state.sweeps[0] % period == 0
+            _draw_action_parameters(model, state, chosen, confidence_too, generator)
+            if confidence_too and not model.is_fixed[ALPHA]:
                 chosen = softmax_table(model, state.parameters[ALPHA])
             state.sweeps[0] += 1
+        _draw_slips(model, state, chosen, generator)
         log_joint[draw] = log_joint_of(model, state, chosen)
         parameters[draw] = state.parameters
         label[:] = -1
@@ -585,15 +589,12 @@ def _log(probability):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True)
 def _draw_slips(model, state, chosen, generator):  # type: ignore[no-untyped-def]
-    """Which actions are slips, and then the probability of one."""
+    """Which actions are slips."""
     slip = state.parameters[SLIP]
-    slips = 0
     for t in range(state.subgoal_of.shape[0]):
         unexplained = slip * model.uniform[model.state_of[t]]
         explained = (1.0 - slip) * chosen[model.pair_of[t], state.subgoal_of[t]]
         state.slipped[t] = generator.random() * (explained + unexplained) < unexplained
-        slips += state.slipped[t]
-    _draw_beta(model, state, SLIP, slips, state.subgoal_of.shape[0] - slips, generator)
 
 
 @njit(nogil=True, cache=True)
@@ -601,12 +602,11 @@ def _draw_beta(model, state, parameter, successes, failures, generator):  # type
     if not model.is_fixed[parameter]:
         a, b = model.hyper[parameter]
         drawn = generator.beta(a + successes, b + failures)
-        # Off 0 and 1, which would rule out for ever what is only improbable.
-        state.parameters[parameter] = min(max(drawn, 1e-12), 1.0 - 1e-12)
+        state.parameters[parameter] = min(max(drawn, _RAREST), 1.0 - _RAREST)
 
 
 @njit(nogil=True, cache=True)
-def _draw_probabilities(model, state, generator):  # type: ignore[no-untyped-def]
+def _draw_switch_probabilities(model, state, generator):  # type: ignore[no-untyped-def]
     """The three switch probabilities, given where there were switches."""
     switches = np.zeros((3, 2), dtype=np.int64)
     for t in range(1, state.subgoal_of.shape[0]):
@@ -626,28 +626,28 @@ def _draw_probabilities(model, state, generator):  # type: ignore[no-untyped-def
 @njit(nogil=True, cache=True)
 def _draw_concentration(model, state, generator):  # type: ignore[no-untyped-def]
     """Eta, given the draws from the urns."""
-    drawn = np.zeros(model.parts, dtype=np.int64)
-    for candidate in range(state.counts.shape[0]):
-        drawn[model.candidate_part[candidate]] += state.counts[candidate]
-    nothing = np.empty((0, 1))
-    _draw_positive(model, state, ETA, (state.counts, drawn, nothing, nothing[:, 0]), generator)
+    if not model.is_fixed[ETA]:
+        drawn = np.zeros(model.parts, dtype=np.int64)
+        for candidate in range(state.counts.shape[0]):
+            drawn[model.candidate_part[candidate]] += state.counts[candidate]
+        nothing = np.empty((0, 1))
+        evidence = (state.counts, drawn, nothing, nothing[:, 0], nothing[:, 0])
+        _draw_by_slice(model, state.parameters, ETA, evidence, generator)
 
 
 @njit(nogil=True, cache=True)
-def _draw_confidence(model, state, generator):  # type: ignore[no-untyped-def]
-    """Alpha, given which actions are slips and what the others cost."""
+def _draw_action_parameters(model, state, chosen, confidence_too, generator):  # type: ignore[no-untyped-def]
+    """The probability of a slip, and alpha, given the subgoals; which actions slipped is open.
+
+    Given the slips, either would move in very small steps.
+    """
     actions, candidates = model.cost.shape[1:]
-    keys = np.empty(state.subgoal_of.shape[0], dtype=np.int64)
-    explained = 0
-    for t in range(keys.shape[0]):
-        if not state.slipped[t]:
-            keys[explained] = model.pair_of[t] * candidates + state.subgoal_of[t]
-            explained += 1
-    keys = np.sort(keys[:explained])
-    costs = np.empty((explained, actions + 1))
-    times = np.zeros(explained)
+    keys = np.sort(model.pair_of * candidates + state.subgoal_of)
+    costs = np.empty((keys.shape[0], actions + 1))
+    times = np.zeros(keys.shape[0])
+    uniform = np.empty(keys.shape[0])
     rows = 0
-    for index in range(explained):
+    for index in range(keys.shape[0]):
         if index > 0 and keys[index] == keys[index - 1]:
             times[rows - 1] += 1.0
             continue
@@ -656,55 +656,78 @@ def _draw_confidence(model, state, generator):  # type: ignore[no-untyped-def]
         costs[rows, 0] = cost[model.pair_action[pair], candidate]
         costs[rows, 1:] = cost[:, candidate]
         times[rows] = 1.0
+        uniform[rows] = model.uniform[model.pair_state[pair]]
         rows += 1
     none = state.counts[:0]
-    _draw_positive(model, state, ALPHA, (none, none, costs[:rows], times[:rows]), generator)
+    evidence = (none, none, costs[:rows], times[:rows], uniform[:rows])
+    if not model.is_fixed[SLIP]:
+        _draw_by_slice(model, state.parameters, SLIP, evidence, generator)
+    if confidence_too and not model.is_fixed[ALPHA]:
+        _draw_by_slice(model, state.parameters, ALPHA, evidence, generator)
 
 
 @njit(nogil=True, cache=True)
-def _draw_positive(model, state, parameter, evidence, generator):  # type: ignore[no-untyped-def]
-    """Alpha or eta, by slice sampling of its logarithm (Neal 2003, stepping out)."""
-    now = math.log(state.parameters[parameter])
-    level = _log_density(model, parameter, evidence, now) - generator.standard_exponential()
+def _draw_by_slice(model, parameters, parameter, evidence, generator):  # type: ignore[no-untyped-def]
+    """A parameter by slice sampling (Neal 2003, stepping out) on an unbounded scale."""
+    now = math.log(parameters[parameter])
+    if parameter == SLIP:
+        now -= math.log1p(-parameters[parameter])
+    level = _log_density(model, parameters, parameter, evidence, now)
+    level -= generator.standard_exponential()
     low = now - _SLICE * generator.random()
     high = low + _SLICE
-    while _log_density(model, parameter, evidence, low) > level:
+    while _log_density(model, parameters, parameter, evidence, low) > level:
         low -= _SLICE
-    while _log_density(model, parameter, evidence, high) > level:
+    while _log_density(model, parameters, parameter, evidence, high) > level:
         high += _SLICE
     while True:
         proposed = low + generator.random() * (high - low)
-        if _log_density(model, parameter, evidence, proposed) >= level:
+        if _log_density(model, parameters, parameter, evidence, proposed) >= level:
             break
         if proposed < now:
             low = proposed
         else:
             high = proposed
-    state.parameters[parameter] = math.exp(proposed)
+    parameters[parameter] = _unscaled(parameter, proposed)
 
 
 @njit(nogil=True, cache=True)
-def _log_density(model, parameter, evidence, log_value):  # type: ignore[no-untyped-def]
-    """Log density of the logarithm of alpha or eta, but for a constant.
+def _unscaled(parameter, scaled):  # type: ignore[no-untyped-def]
+    """A parameter from its logarithm, or a probability from its logit."""
+    if parameter == SLIP:
+        return min(max(1.0 / (1.0 + math.exp(-scaled)), _RAREST), 1.0 - _RAREST)
+    return math.exp(scaled)
 
-    The evidence on eta: (G,) draws of each candidate, and their number in each part. That on
-    alpha: costs (M, A + 1) of an action taken and of all it was chosen from, and (M,) how often.
+
+@njit(nogil=True, cache=True)
+def _log_density(model, parameters, parameter, evidence, scaled):  # type: ignore[no-untyped-def]
+    """Log density of the logarithm of alpha or eta, or the logit of slip, but for a constant.
+
+    The evidence on eta: (G,) draws of each candidate, and their number in each part. That on alpha
+    and slip: costs (M, A + 1) of an action taken and of all it was chosen from, how often (M,),
+    and the probability (M,) of each action that is a slip.
     """
-    value = math.exp(log_value)
-    median, sigma = model.hyper[parameter]
-    density = -0.5 * ((log_value - math.log(median)) / sigma) ** 2
-    counts, drawn, costs, times = evidence
+    value = _unscaled(parameter, scaled)
+    first, second = model.hyper[parameter]
+    if parameter == SLIP:
+        density = first * math.log(value) + second * math.log1p(-value)
+    else:
+        density = -0.5 * ((scaled - math.log(first)) / second) ** 2
+    counts, drawn, costs, times, uniform = evidence
     for part in range(drawn.shape[0]):
         density += math.lgamma(value) - math.lgamma(value + drawn[part])
     for candidate in range(counts.shape[0]):
         if counts[candidate] > 0:
             weight = value * model.prior[candidate]
             density += math.lgamma(weight + counts[candidate]) - math.lgamma(weight)
+    alpha = value if parameter == ALPHA else parameters[ALPHA]
+    slip = value if parameter == SLIP else parameters[SLIP]
     for row in range(costs.shape[0]):
         total = 0.0
         for action in range(1, costs.shape[1]):
-            total += math.exp(-value * costs[row, action])
-        density -= times[row] * (value * costs[row, 0] + math.log(total))
+            total += math.exp(-alpha * costs[row, action])
+        explained = (1.0 - slip) * math.exp(-alpha * costs[row, 0]) / total
+        density += times[row] * _log(explained + slip * uniform[row])
     return density
 
 

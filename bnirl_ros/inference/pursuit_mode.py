@@ -168,10 +168,11 @@ def _replacements(model, state, chosen, candidate):  # type: ignore[no-untyped-d
         if state.subgoal_of[t] == candidate:
             state.partition_of[t] = 0
     scores = group_scores(model, state, chosen, 2)[0]
-    likely = scores.argsort()[::-1][:_REPLACEMENTS]
-    replacements = np.full(likely.shape[0] + 1, -1, dtype=np.int64)
-    replacements[1:] = likely
-    return replacements[(replacements < 0) | (replacements != candidate)]
+    replacements = [-1]
+    for other in scores.argsort()[::-1][:_REPLACEMENTS]:
+        if other != candidate and scores[other] > -np.inf:
+            replacements.append(other)
+    return replacements
 
 
 @njit(nogil=True, cache=True)
