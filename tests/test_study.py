@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bnirl_ros.demonstrations.demonstration import Demonstration
+from bnirl_ros.errors import InputError
+from bnirl_ros.experiments.study import (
+    kitchens,
+    next_action,
+    turtle,
+)
 from bnirl_ros.experiments.study.intervals import ratio_interval, wilson
-from bnirl_ros.experiments.study.part import MODELS, settings_of
+from bnirl_ros.experiments.study.part import MODELS, Part, settings_of
 from bnirl_ros.experiments.study.report import Table, share
 from bnirl_ros.experiments.study.scores import (
     goes_round,
@@ -17,7 +26,13 @@ from bnirl_ros.experiments.study.scores import (
     top_hits,
     visits,
 )
+from bnirl_ros.inference.posterior import grid_world, infer
 from bnirl_ros.inference.settings import Settings
+from bnirl_ros.inference.summary import Pursuit, Subgoal, Summary, nothing_found
+from bnirl_ros.maps import GridMap
+from bnirl_ros.mdp.actions import ACTION_NAMES
+from bnirl_ros.mdp.goal_values import goal_values
+from bnirl_ros.model.likelihood import action_log_likelihood
 
 # What is found against what is true
 
@@ -108,3 +123,140 @@ def test_tables_are_markdown() -> None:
 def test_the_settings_are_the_shipped_ones_but_for_the_chains() -> None:
     for model in MODELS:
         assert replace(settings_of(model), chains=Settings().chains) == Settings(model=model)
+
+
+# The turtle
+
+
+def turtle_summary(*cells: tuple[int, int], pursued: Sequence[int] = ()) -> Summary:
+    """Subgoals in these cells of 0.5 m, visited by rank, or pursued as said."""
+    grid_map = GridMap(np.ones((23, 23), dtype=bool), 0.5)
+    positions = grid_map.centres_of(np.array(cells))
+    return replace(
+        nothing_found(grid_map),
+        subgoals=tuple(
+            Subgoal(rank, cell, (float(x), float(y)), 1.0, 1, ())
+            for rank, (cell, (x, y)) in enumerate(zip(cells, positions, strict=True), start=1)
+        ),
+        visit_sequence=tuple(range(1, len(cells) + 1)),
+        pursuits=tuple(Pursuit(0, rank, 0, 0, True) for rank in pursued),
+    )
+
+
+def test_score_of_the_turtle() -> None:
+    # Centres (4.25, 5.25), (3.75, 5.75), (0.25, 0.25), (1.25, 1.75), (2.25, 9.25) [m].
+    cells = [(8, 10), (7, 11), (0, 0), (2, 3), (4, 18)]
+    score = turtle.score(turtle_summary(*cells))
+    assert (score.found, score.strays, score.duplicates) == (3, 1, 1)
+    assert (score.visited, score.in_order) == ([0, 1, 2], True)
+    # Rank 3 is at no waypoint, rank 2 at that of rank 1.
+    score = turtle.score(turtle_summary(*cells, pursued=(5, 1, 3, 2, 4, 5, 1)))
+    assert (score.visited, score.in_order) == ([2, 0, 1, 2, 0], True)
+    score = turtle.score(turtle_summary(*cells, pursued=(5, 1, 4, 1)))
+    assert (score.visited, score.in_order) == ([2, 0, 1, 0], False)
+
+
+def test_the_table_of_the_turtle() -> None:
+    result = turtle.run("paper")
+    assert len(result["positions"]) == result["found"] + result["strays"] + result["duplicates"]
+    ((model, found, *_),) = turtle.table([result]).rows
+    assert (model, found) == ("paper", f"{result['found']} of 6")
+
+
+# The kitchens
+
+
+def test_true_cells_have_their_share_of_the_interactions() -> None:
+    interactions = np.repeat([[1, 1], [2, 1], [3, 1]], [64, 3, 33], axis=0)
+    assert kitchens.true_cells(interactions) == {(1, 1), (2, 1), (3, 1)}
+    interactions = np.repeat([[1, 1], [2, 1], [3, 1]], [65, 2, 33], axis=0)
+    assert kitchens.true_cells(interactions) == {(1, 1), (3, 1)}
+
+
+def test_rankings_without_a_model(tmp_path: Path) -> None:
+    rows = ["0,0,1,1,.,0", "0,1,1,1,E,0", "0,2,2,1,I,1", "0,3,2,1,W,0", "0,4,1,1,.,0"]
+    rows += ["1,0,1,1,E,0", "1,1,2,1,E,0", "1,2,3,1,I,0", "1,3,3,1,I,1", "1,4,3,1,.,0"]
+    csv = "\n".join(["episode,t,x,y,action,interact_ok", *rows])
+    (tmp_path / "tiny.csv").write_text(csv, encoding="utf-8")
+    (tmp_path / "tiny.grid.txt").write_text("XXXXX\nX   X\nXXXXX\n", encoding="utf-8")
+    # (1, 1): 4 steps, 3 entries; (2, 1): 3 and 2; (3, 1): 3 and 1.
+    assert kitchens.rank_by_dwell(tmp_path, "tiny") == [(1, 1), (2, 1), (3, 1)]
+    assert kitchens.rank_by_visits(tmp_path, "tiny") == [(1, 1), (2, 1), (3, 1)]
+    assert kitchens.rank_by_stays(tmp_path, "tiny") == [(3, 1), (2, 1)]
+    result = kitchens.run(kitchens.Case(tmp_path, "tiny", "visits"))
+    assert (result["true"], result["hits"]) == ([(2, 1), (3, 1)], 1)
+
+
+def test_an_episodes_first_cell_is_entered() -> None:
+    paths = np.array([[0, 1, 1], [0, 1, 1], [0, 2, 1], [1, 2, 1], [1, 1, 1]])
+    assert kitchens.entries(paths).tolist() == [[1, 1], [2, 1], [2, 1], [1, 1]]
+
+
+@pytest.mark.parametrize("part", [kitchens.PART, next_action.PART])
+def test_parts_without_their_recordings_say_so(part: Part, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"random3.*cannot be read|there is no such folder"):
+        part.cases(tmp_path / "nowhere")
+
+
+# The next action
+
+CORRIDOR = GridMap(np.array([[True, True, False]]))
+
+
+def in_corridor(*steps: tuple[int, int, str]) -> Demonstration:
+    """Observations (episode, x, action) in the corridor of two cells."""
+    episode, x, names = zip(*steps, strict=True)
+    return Demonstration(
+        episode=np.array(episode),
+        cells=np.column_stack([x, np.zeros(len(x), dtype=np.int64)]),
+        action=np.array([ACTION_NAMES.index(name) for name in names]),
+        last_episode=np.empty(0, dtype=np.int64),
+        last_cells=np.empty((0, 2), dtype=np.int64),
+    )
+
+
+def test_frequencies_are_those_of_outcomes() -> None:
+    learnt = in_corridor((0, 0, "E"), (0, 1, "stay"), (0, 1, "N"), (0, 1, "E"), (0, 1, "W"))
+    held_out = in_corridor((2, 0, "E"), (2, 0, "stay"), (2, 1, "S"), (2, 1, "W"))
+    world = grid_world(CORRIDOR, Settings())
+    # In each cell staying, by whatever blocked move, and the move to the other one.
+    foreseen = next_action.predict_frequency(learnt, held_out, world)
+    assert np.exp(foreseen) == pytest.approx([1.5 / 2, 0.5 / 2, 3.5 / 5, 1.5 / 5])
+    alike = next_action.predict_uniform(learnt, held_out, world)
+    assert np.exp(alike) == pytest.approx([0.5] * 4)
+    assert next_action.actions_alike(held_out, world).tolist() == [1, 8, 8, 1]
+
+
+def test_the_papers_prediction_is_the_urn_over_its_draws() -> None:
+    settings = Settings(sweeps=30, burn_in=10, chains=2, alpha=1.0, eta=0.5)
+    learnt = in_corridor(*[(0, 0, "E"), (0, 1, "stay"), (0, 1, "W")] * 2)
+    held_out = in_corridor((2, 0, "E"), (2, 1, "W"))
+    posterior = infer(learnt, CORRIDOR, settings)
+    world = grid_world(CORRIDOR, settings)
+    values = goal_values(world, world.states_of(posterior.candidates), [0, 1])
+    likelihood = np.exp(action_log_likelihood(values, 1.0))  # (state, action, subgoal)
+    expected = np.zeros(2)
+    drawn = posterior.draws.subgoal_of.reshape(-1, len(learnt))
+    for subgoal_of in drawn:
+        for subgoal in range(2):
+            weight = ((subgoal_of == subgoal).sum() + 0.5 / 2) / (6 + 0.5)
+            expected += weight * likelihood[[0, 1], [1, 5], subgoal] / len(drawn)
+    foreseen = next_action.predict_exchangeable(posterior, held_out, CORRIDOR, settings)
+    assert np.exp(foreseen) == pytest.approx(expected)
+
+
+def test_all_outcomes_together_are_certain() -> None:
+    settings = Settings(sweeps=30, burn_in=10, chains=1)
+    posterior = infer(in_corridor((0, 0, "E"), (0, 1, "W")), CORRIDOR, settings)
+    either = in_corridor((2, 0, "E"), (2, 0, "stay"))
+    foreseen = next_action.predict_exchangeable(posterior, either, CORRIDOR, settings)
+    alike = next_action.actions_alike(either, grid_world(CORRIDOR, settings))
+    assert (np.exp(foreseen) * alike).sum() == pytest.approx(1.0)
+
+
+def test_players_of_a_trial_stay_together() -> None:
+    demonstration = in_corridor(*((episode, 0, "E") for episode in range(7)))
+    demonstration = replace(demonstration, last_episode=np.array([1, 2]), last_cells=np.eye(2))
+    learnt, held_out = next_action.split_trials(demonstration)
+    assert (learnt.episode.tolist(), held_out.episode.tolist()) == ([0, 1, 4, 5], [2, 3, 6])
+    assert (learnt.last_episode.tolist(), held_out.last_episode.tolist()) == ([1], [2])
