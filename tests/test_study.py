@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,23 +15,33 @@ from bnirl_ros.errors import InputError
 from bnirl_ros.experiments.study import (
     kitchens,
     next_action,
+    robustness,
     turtle,
 )
 from bnirl_ros.experiments.study.intervals import ratio_interval, wilson
 from bnirl_ros.experiments.study.part import MODELS, Part, settings_of
 from bnirl_ros.experiments.study.report import Table, share
 from bnirl_ros.experiments.study.scores import (
+    apart,
     goes_round,
     matches,
     nearest_within,
     top_hits,
     visits,
 )
+from bnirl_ros.experiments.study.simulated import (
+    Demonstrator,
+    Leg,
+    demonstrate,
+    itinerary,
+    random_map,
+    random_subgoals,
+)
 from bnirl_ros.inference.posterior import grid_world, infer
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.inference.summary import Pursuit, Subgoal, Summary, nothing_found
 from bnirl_ros.maps import GridMap
-from bnirl_ros.mdp.actions import ACTION_NAMES
+from bnirl_ros.mdp.actions import ACTION_NAMES, STEPS
 from bnirl_ros.mdp.goal_values import goal_values
 from bnirl_ros.model.likelihood import action_log_likelihood
 
@@ -260,3 +271,103 @@ def test_players_of_a_trial_stay_together() -> None:
     learnt, held_out = next_action.split_trials(demonstration)
     assert (learnt.episode.tolist(), held_out.episode.tolist()) == ([0, 1, 4, 5], [2, 3, 6])
     assert (learnt.last_episode.tolist(), held_out.last_episode.tolist()) == ([1], [2])
+
+
+# Simulated demonstrators
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_every_free_cell_of_a_random_map_is_within_reach(seed: int) -> None:
+    grid_map = random_map(np.random.default_rng(seed))
+    world = grid_world(grid_map, Settings())
+    free = np.flatnonzero(world.free)
+    values = goal_values(world, free, free)
+    assert 0.6 * grid_map.free.size <= len(free) < grid_map.free.size
+    assert (values.max(axis=1) > 0.0).all()
+
+
+def test_random_subgoals_lie_apart() -> None:
+    generator = np.random.default_rng(0)
+    grid_map = random_map(generator)
+    subgoals = random_subgoals(grid_map, generator)
+    assert len(set(subgoals)) == 4
+    assert grid_map.is_free(subgoals).all()
+    assert all(apart(one, other) >= 4 for one, other in combinations(subgoals, 2))
+
+
+def legs_of(demonstrator: Demonstrator, subgoals: list[tuple[int, int]]) -> list[Leg]:
+    """The legs of many episodes on an open map."""
+    generator = np.random.default_rng(0)
+    grid_map = GridMap(np.ones((15, 15), dtype=bool))
+    return [
+        leg for _ in range(200) for leg in itinerary(demonstrator, subgoals, grid_map, generator)
+    ]
+
+
+def test_habits_show_in_the_legs() -> None:
+    subgoals = [(0, 0), (7, 0), (0, 7), (7, 7)]
+    plain = legs_of(Demonstrator(), subgoals)
+    assert len(plain) == 2400
+    assert all(leg.target == leg.subgoal and leg.share == np.inf for leg in plain)
+    counts = np.array([sum(leg.subgoal == subgoal for leg in plain) for subgoal in subgoals])
+    assert (np.diff(counts) < 0).all()  # those with more weight more often
+    episode = plain[:12]
+    assert all(one.subgoal != other.subgoal for one, other in pairwise(episode))
+
+    detours = legs_of(Demonstrator(detours=0.3), subgoals)
+    assert 0.27 < sum(leg.subgoal is None for leg in detours) / 2400 < 0.33
+    minds = legs_of(Demonstrator(changes_of_mind=0.3), subgoals)
+    assert 0.27 < sum(leg.share == 0.5 for leg in minds) / 2400 < 0.33
+    sloppy = legs_of(Demonstrator(sloppiness=1), subgoals)
+    assert {leg.target for leg in sloppy if leg.subgoal == (0, 0)} == {
+        (x, y) for x in (0, 1) for y in (0, 1)
+    }
+
+
+@pytest.mark.parametrize(
+    "demonstrator",
+    [
+        Demonstrator(),
+        Demonstrator(success=1.0, noise=0.0),
+        Demonstrator(detours=0.3, pauses=0.1, changes_of_mind=0.3, sloppiness=1),
+    ],
+)
+def test_demonstrations_are_walks_that_end_where_they_say(demonstrator: Demonstrator) -> None:
+    generator = np.random.default_rng(3)
+    grid_map = random_map(generator)
+    demonstration, truth = demonstrate(demonstrator, grid_map, generator)
+    assert grid_map.is_free(demonstration.cells).all()
+    assert demonstration.last_episode.tolist() == [0, 1, 2]
+    world = grid_world(grid_map, Settings())
+    for episode in range(3):
+        cells = demonstration.cells[demonstration.episode == episode]
+        path = world.states_of(np.concatenate([cells, demonstration.last_cells[[episode]]]))
+        assert (path[1:, None] == world.outcomes()[path[:-1]]).any(axis=1).all()
+    assert 1 <= len(truth) <= 4
+    if not demonstrator.sloppiness:
+        everywhere = np.concatenate([demonstration.cells, demonstration.last_cells]).tolist()
+        assert all(list(cell) in everywhere for cell in truth)
+
+
+def test_standing_still_is_all_that_a_pause_adds() -> None:
+    grid_map = GridMap(np.ones((15, 15), dtype=bool))
+    still = Demonstrator(success=1.0, noise=0.0, pauses=0.2)
+    demonstration, _ = demonstrate(still, grid_map, np.random.default_rng(0))
+    stays = demonstration.action == ACTION_NAMES.index("stay")
+    steps = np.diff(demonstration.cells, axis=0)
+    within = np.diff(demonstration.episode) == 0
+    np.testing.assert_array_equal(
+        STEPS[demonstration.action[:-1]][within], steps[within]
+    )  # with success 1 every action leads where it points
+    # A fifth of the steps are preceded by 3 to 6 of standing still.
+    assert 0.35 < stays.mean() < 0.6
+
+
+def test_a_case_of_the_robustness_table() -> None:
+    case = robustness.Case("paper", "as assumed", 0)
+    result = robustness.run(case)
+    assert result == robustness.run(case)
+    assert result["exact"] <= result["near"] <= min(result["true"], result["found"])
+    ((name, model, *cells),) = robustness.table([result]).rows
+    assert (name, model, len(cells)) == ("as assumed", "paper", 5)
+    assert cells[0].startswith(f"{100 * result['exact'] / result['true']:.0f} (")

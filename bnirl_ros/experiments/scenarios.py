@@ -137,7 +137,7 @@ def demonstrate(scenario: Scenario, generator: np.random.Generator) -> Demonstra
                 episode.append(number)
                 states.append(state)
                 choices.append(choice)
-                state = int(outcomes[state, _outcome_of(choice, world, generator)])
+                state = int(outcomes[state, outcome_of(choice, world, generator)])
     return Demonstration(
         episode=np.array(episode, dtype=np.int64),
         cells=world.cells_of(states),
@@ -157,8 +157,8 @@ def _one_of(actions: npt.NDArray[np.int64], generator: np.random.Generator) -> i
     return int(actions[int(generator.random() * len(actions))])
 
 
-def _outcome_of(choice: int, world: GridWorld, generator: np.random.Generator) -> int:
-    """Position of the action that happens when `choice` is taken."""
+def outcome_of(choice: int, world: GridWorld, generator: np.random.Generator) -> int:
+    """Position of the action that happens when the one at the position `choice` is taken."""
     if generator.random() < world.success:
         return choice
     others = np.delete(np.arange(len(world.actions)), choice)
