@@ -8,7 +8,9 @@ PYTHON ?=
 WITH ?=
 # Further arguments for pytest, such as PYTEST_ARGS='-k bags -x'.
 PYTEST_ARGS ?=
-# The folder with the recordings of human play, for `make bags`.
+# Further arguments for the study, such as STUDY_ARGS='--only turtle --jobs 1'.
+STUDY_ARGS ?=
+# The folder with the recordings of human play, for `make bags` and `make study`.
 OVERCOOKED ?= ../shared/data/overcooked
 # The recording of a turtlesim robot, for `make bags`.
 TURTLE ?= ../shared/data/bags/turtle_waypoints
@@ -25,7 +27,7 @@ endif
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 unexport AMENT_PREFIX_PATH PYTHONPATH PYTHONHOME RMW_IMPLEMENTATION
 
-.PHONY: help demo test lint unit bags benchmark venv clean
+.PHONY: help demo test lint unit bags benchmark study venv clean
 
 help:  ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -49,6 +51,9 @@ bags: venv  ## Make the bags in bags/ again
 
 benchmark: venv  ## Time the main job and its parts
 	$(BIN)/python benchmarks/main_job.py
+
+study: venv  ## Measure what the models find, into bnirl_out/study.md
+	$(BIN)/python -m bnirl_ros.experiments.study --overcooked "$(OVERCOOKED)" $(STUDY_ARGS)
 
 venv:  ## Make the virtual environment, or bring it up to date
 	@scripts/venv $(VENV)

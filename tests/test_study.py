@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.errors import InputError
 from bnirl_ros.experiments.study import (
+    cost,
     kitchens,
     next_action,
+    reliability,
     robustness,
     turtle,
 )
+from bnirl_ros.experiments.study.__main__ import main
 from bnirl_ros.experiments.study.intervals import ratio_interval, wilson
 from bnirl_ros.experiments.study.part import MODELS, Part, settings_of
 from bnirl_ros.experiments.study.report import Table, share
@@ -371,3 +376,92 @@ def test_a_case_of_the_robustness_table() -> None:
     ((name, model, *cells),) = robustness.table([result]).rows
     assert (name, model, len(cells)) == ("as assumed", "paper", 5)
     assert cells[0].startswith(f"{100 * result['exact'] / result['true']:.0f} (")
+
+
+# What is stated, and what it costs
+
+
+def test_bins_and_their_bands_by_hand() -> None:
+    stated = np.array([0.9, 0.9, 0.9, 0.02, 1.0])
+    true = np.array([True, True, False, False, True])
+    bins = reliability.bins_of(stated, true, np.array([0, 0, 1, 0, 1]))
+    claimed = bins[reliability.CLAIMED]
+    assert (claimed.statements, claimed.stated) == (3, pytest.approx(0.9))
+    assert claimed.observed == pytest.approx(2 / 3)
+    z = 2.5758293035489
+    # True less stated: 0.2 in the first demonstration, -0.9 in the second.
+    assert claimed.band == pytest.approx(z * np.sqrt(0.2**2 + 0.9**2) / 3)
+    assert claimed.band_if_independent == pytest.approx(z * np.sqrt(3 * 0.09) / 3)
+    assert claimed.holds
+    assert [each.statements for each in bins] == [1, *[0] * 8, 3, 1]
+    assert all(each.holds for each in bins)
+
+
+def statements(
+    generator: np.random.Generator, bias: float
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
+    """Statements of 0.9, two a demonstration, both true or both not, less often by `bias`."""
+    true = np.repeat(generator.random(500) < 0.9 - bias, 2)
+    return np.full(1000, 0.9), true, np.repeat(np.arange(500), 2)
+
+
+def test_the_band_holds_where_statements_depend_on_each_other() -> None:
+    generator = np.random.default_rng(0)
+    right = [reliability.reliability(*statements(generator, 0.0)) for _ in range(400)]
+    assert 0.975 <= np.mean([each.holds for each in right]) <= 1.0
+    # As if they were independent, the band would be too narrow.
+    alone = [abs(each.observed - 0.9) <= each.band_if_independent for each in right]
+    assert np.mean(alone) < 0.96
+    wrong = [reliability.reliability(*statements(generator, 0.1)) for _ in range(20)]
+    assert not any(each.holds for each in wrong)
+
+
+def test_the_simulated_prior_is_the_urns() -> None:
+    generator = np.random.default_rng(0)
+    sizes = []
+    for _ in range(300):
+        demonstration, grid_map, truth = reliability.simulate_exchangeable(generator)
+        assert len(demonstration) == 40
+        assert grid_map.is_free(np.concatenate([demonstration.cells, truth])).all()
+        sizes.append(len(truth))
+    # 4.28 partitions on average, sum of 1 / i, some of which share a subgoal by chance.
+    partitions = (1.0 / np.arange(1, 41)).sum()
+    assert partitions * 0.8 < np.mean(sizes) < partitions
+
+
+def test_a_case_of_the_reliability_table() -> None:
+    result = reliability.run(reliability.Case("paper", 0))
+    assert len(result["stated"]) == len(result["true"])
+    assert sum(result["true"]) >= 1
+    assert len(reliability.table([result]).rows) == len(reliability.EDGES) - 1
+
+
+def test_the_demonstration_for_the_cost_is_as_long_as_said() -> None:
+    demonstration = cost.long_demonstration()
+    assert len(demonstration) == 10_000
+    assert cost.MAP.free.sum() == 200
+    assert (demonstration.last_episode < demonstration.episode[-1]).all()
+
+
+# The command
+
+
+def test_the_command_writes_tables_and_numbers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "deep" / "study.md"
+    arguments = ["--only", "turtle", "--only", "overcooked", "--jobs", "1", "--out", str(out)]
+    assert main([*arguments, "--overcooked", str(tmp_path / "nowhere")]) == 1
+    printed = capsys.readouterr()
+    assert "turtle: 1 of " in printed.out or "turtle: 2 of " in printed.out
+    assert printed.err.startswith("overcooked: left out: ")
+    assert out.read_text(encoding="utf-8").startswith("### A turtle driven")
+    numbers = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
+    assert [result["model"] for result in numbers["turtle"]] == list(MODELS)
+
+
+def test_wrong_arguments_of_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in (["--jobs", "0"], ["--only", "nothing"]):
+        with pytest.raises(SystemExit, match=r"^2$"):
+            main(arguments)
+    assert "must be at least 1" in capsys.readouterr().err
