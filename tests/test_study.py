@@ -22,7 +22,7 @@ from bnirl_ros.experiments.study import (
     robustness,
     turtle,
 )
-from bnirl_ros.experiments.study.__main__ import main
+from bnirl_ros.experiments.study.__main__ import PARTS, main
 from bnirl_ros.experiments.study.intervals import ratio_interval, wilson
 from bnirl_ros.experiments.study.part import MODELS, Part, settings_of
 from bnirl_ros.experiments.study.report import Table, share
@@ -458,6 +458,17 @@ def test_the_command_writes_tables_and_numbers(
     assert out.read_text(encoding="utf-8").startswith("### A turtle driven")
     numbers = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
     assert [result["model"] for result in numbers["turtle"]] == list(MODELS)
+
+
+def test_without_recordings_the_rest_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    two = {name: PARTS[name] for name in ("overcooked", "turtle")}
+    monkeypatch.setattr("bnirl_ros.experiments.study.__main__.PARTS", two)
+    arguments = ["--jobs", "1", "--out", str(tmp_path / "study.md")]
+    assert main([*arguments, "--overcooked", str(tmp_path / "nowhere")]) == 0
+    assert capsys.readouterr().err.count("\n") == 1
+    assert (tmp_path / "study.md").read_text(encoding="utf-8").startswith("### A turtle driven")
 
 
 def test_wrong_arguments_of_the_command(capsys: pytest.CaptureFixture[str]) -> None:
