@@ -22,7 +22,7 @@ from bnirl_ros.maps.grid_map import GridMap
 from bnirl_ros.mdp.grid_world import GridWorld
 from bnirl_ros.model.candidates import candidate_cells
 from bnirl_ros.model.mixture import SubgoalMixture, subgoal_mixture
-from bnirl_ros.model.pursuits import pursuit_model
+from bnirl_ros.model.pursuits import PursuitModel, pursuit_model
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,19 +88,34 @@ def model_of(
     """Candidate cells (G, 2) and the model over them that the settings ask for."""
     world = grid_world(grid_map, settings)
     candidates = candidate_cells(settings.candidates, demonstration, world)
-    states, goals = world.states_of(demonstration.cells), world.states_of(candidates)
     if settings.model == "paper":
         return candidates, subgoal_mixture(
-            world, states, demonstration.action, goals, **settings.fixed
+            world,
+            world.states_of(demonstration.cells),
+            demonstration.action,
+            world.states_of(candidates),
+            **settings.fixed,
         )
+    return candidates, pursuit_model_of(demonstration, candidates, grid_map, settings)
+
+
+def pursuit_model_of(
+    demonstration: Demonstration,
+    candidates: npt.NDArray[np.int64],
+    grid_map: GridMap,
+    settings: Settings,
+) -> PursuitModel:
+    """The sequential model of a demonstration over given candidate cells (G, 2)."""
+    world = grid_world(grid_map, settings)
+    states = world.states_of(demonstration.cells)
     visited = world.cells_of(np.unique(states))
     apart = np.linalg.norm(visited[:, None] - candidates, axis=2) * grid_map.resolution
-    return candidates, pursuit_model(
+    return pursuit_model(
         world,
         states,
         demonstration.action,
         demonstration.starts,
-        goals,
+        world.states_of(candidates),
         arrived=apart <= settings.arrival_radius,
         likelihood=settings.likelihood,
         fixed=settings.fixed,

@@ -10,8 +10,8 @@ A sweep draws, each given all else:
    O(G), not O(G^2). Blocks differ in length from sweep to sweep;
 2. partitions, given the subgoals, by the Chinese restaurant process that the urn collapses, and
    the subgoal of each partition anew: whole groups of pursuits move at once;
-3. the parameters: switch probabilities from their conditionals, the others by slice sampling.
-   Which actions are slips stays open throughout, and is drawn for the record.
+3. the parameters by slice sampling: those of switches together with the switches to the same
+   subgoal again, that of slips while it is open which actions are slips.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ _SHORTEST_BLOCK, _LONGEST_BLOCK = 8, 1024  # observations; their logarithm is un
 _BLOCK_ENTRIES = 4_000_000  # of the forward messages: shorter blocks where candidates are many
 _SLICE = 0.7  # first width of a slice, of a logarithm
 _CONFIDENCE_PERIOD = 4  # sweeps between two draws of alpha, where those cost more than the rest
+_FARTHEST = 27.0  # logarithms and logits are not sought beyond
 _RAREST = 1e-12  # probabilities stay off 0 and 1, which would rule out what is only improbable
 
 # Columns of the parameters, in the order of `PRIORS`.
@@ -232,7 +233,7 @@ def _advance(model, state, generator, thin, subgoal_of, partition_of, log_joint,
         for _ in range(thin):
             _draw_blocks(model, state, chosen, forward, generator)
             _draw_groups(model, state, chosen, generator)
-            _draw_switch_probabilities(model, state, generator)
+            _draw_switches(model, state, generator)
             _draw_concentration(model, state, generator)
             confidence_too = state.sweeps[0] % period == 0
             _draw_action_parameters(model, state, chosen, confidence_too, generator)
@@ -286,13 +287,17 @@ def likelihood(model, parameters, chosen, t, candidate):  # type: ignore[no-unty
 
 
 @njit(nogil=True, cache=True)
+def _place(model, t, candidate):  # type: ignore[no-untyped-def]
+    """0 on arrival at the candidate, 1 where there already, 2 elsewhere."""
+    if not model.arrived[model.state_of[t], candidate]:
+        return 2
+    return 1 if model.arrived[model.state_of[t - 1], candidate] else 0
+
+
+@njit(nogil=True, cache=True)
 def switch_probability(model, parameters, t, candidate):  # type: ignore[no-untyped-def]
     """Rho before observation t, which begins no episode, where `candidate` was pursued."""
-    if not model.arrived[model.state_of[t], candidate]:
-        return parameters[ELSEWHERE]
-    if model.arrived[model.state_of[t - 1], candidate]:
-        return parameters[AT_SUBGOAL]
-    return parameters[ON_ARRIVAL]
+    return parameters[ON_ARRIVAL + _place(model, t, candidate)]
 
 
 @njit(nogil=True, cache=True)
@@ -598,29 +603,96 @@ def _draw_slips(model, state, chosen, generator):  # type: ignore[no-untyped-def
 
 
 @njit(nogil=True, cache=True)
-def _draw_beta(model, state, parameter, successes, failures, generator):  # type: ignore[no-untyped-def]
-    if not model.is_fixed[parameter]:
-        a, b = model.hyper[parameter]
-        drawn = generator.beta(a + successes, b + failures)
-        state.parameters[parameter] = min(max(drawn, _RAREST), 1.0 - _RAREST)
+def _draw_switches(model, state, generator):  # type: ignore[no-untyped-def]
+    """The switch probabilities, and where the subgoal before was drawn again.
+
+    Both given the subgoals and the weights, which are drawn for this step and then forgotten.
+    Given where there were switches, a probability near 1 would move in very small steps.
+    """
+    weights = _draw_weights(model, state, generator)
+    candidates = weights.shape[0]
+    same = np.zeros((3, candidates))
+    changes = np.zeros(3, dtype=np.int64)
+    for t in range(1, state.subgoal_of.shape[0]):
+        if not model.starts[t]:
+            candidate = state.subgoal_of[t - 1]
+            place = _place(model, t, candidate)
+            if state.subgoal_of[t] == candidate:
+                same[place, candidate] += 1.0
+            else:
+                changes[place] += 1
+    no_counts, no_costs, nothing = changes[:0], np.empty((0, 1)), weights[:0]
+    for place in range(3):
+        parameter = ON_ARRIVAL + place
+        if not model.is_fixed[parameter]:
+            evidence = Evidence(
+                no_counts,
+                no_counts,
+                no_costs,
+                nothing,
+                nothing,
+                changes[place : place + 1],
+                same[place],
+                weights,
+            )
+            _draw_by_slice(model, state.parameters, parameter, evidence, generator)
+    state.counts[:] = 0
+    for t in range(state.subgoal_of.shape[0]):
+        candidate = state.subgoal_of[t]
+        if model.starts[t] or candidate != state.subgoal_of[t - 1]:
+            state.switched[t] = True
+        else:
+            rho = state.parameters[ON_ARRIVAL + _place(model, t, candidate)]
+            again = rho * weights[candidate]
+            state.switched[t] = generator.random() * (1.0 - rho + again) < again
+        state.counts[candidate] += state.switched[t]
 
 
 @njit(nogil=True, cache=True)
-def _draw_switch_probabilities(model, state, generator):  # type: ignore[no-untyped-def]
-    """The three switch probabilities, given where there were switches."""
-    switches = np.zeros((3, 2), dtype=np.int64)
-    for t in range(1, state.subgoal_of.shape[0]):
-        if model.starts[t]:
-            continue
-        candidate = state.subgoal_of[t - 1]
-        place = 2
-        if model.arrived[model.state_of[t], candidate]:
-            place = 1 if model.arrived[model.state_of[t - 1], candidate] else 0
-        switches[place, 0 if state.switched[t] else 1] += 1
-    for place in range(3):
-        _draw_beta(
-            model, state, ON_ARRIVAL + place, switches[place, 0], switches[place, 1], generator
-        )
+def _draw_weights(model, state, generator):  # type: ignore[no-untyped-def]
+    """(G,) weight of each candidate that is pursued, given all draws; 0 for the others."""
+    total = np.zeros(model.parts)
+    left = np.zeros(model.parts)
+    weights = np.zeros(state.counts.shape[0])
+    for candidate in range(weights.shape[0]):
+        part, weight = model.candidate_part[candidate], state.parameters[ETA]
+        weight *= model.prior[candidate]
+        if state.counts[candidate] > 0:
+            weights[candidate] = generator.standard_gamma(weight + state.counts[candidate])
+            total[part] += weights[candidate]
+        else:
+            left[part] += weight
+    for part in range(model.parts):
+        if left[part] > 0.0:
+            total[part] += generator.standard_gamma(left[part])
+    for candidate in range(weights.shape[0]):
+        if weights[candidate] > 0.0:
+            weights[candidate] /= total[model.candidate_part[candidate]]
+    return weights
+
+
+class Evidence(NamedTuple):
+    """What there is on one parameter; empty what there is on others.
+
+    Attributes:
+        counts: (G,) on eta: draws of each candidate.
+        drawn: (P,) their number in each part.
+        costs: (M, A + 1) on alpha and slip: costs of an action taken, and of all actions.
+        times: (M,) how often.
+        uniform: (M,) its probability if it is a slip.
+        changes: (1,) on a switch probability: how often the subgoal changed.
+        same: (G,) how often it remained the same.
+        weights: (G,) probability of drawing the same again.
+    """
+
+    counts: npt.NDArray[np.int64]
+    drawn: npt.NDArray[np.int64]
+    costs: npt.NDArray[np.float64]
+    times: npt.NDArray[np.float64]
+    uniform: npt.NDArray[np.float64]
+    changes: npt.NDArray[np.int64]
+    same: npt.NDArray[np.float64]
+    weights: npt.NDArray[np.float64]
 
 
 @njit(nogil=True, cache=True)
@@ -630,8 +702,17 @@ def _draw_concentration(model, state, generator):  # type: ignore[no-untyped-def
         drawn = np.zeros(model.parts, dtype=np.int64)
         for candidate in range(state.counts.shape[0]):
             drawn[model.candidate_part[candidate]] += state.counts[candidate]
-        nothing = np.empty((0, 1))
-        evidence = (state.counts, drawn, nothing, nothing[:, 0], nothing[:, 0])
+        nothing = np.empty(0)
+        evidence = Evidence(
+            state.counts,
+            drawn,
+            np.empty((0, 1)),
+            nothing,
+            nothing,
+            drawn[:0],
+            nothing,
+            nothing,
+        )
         _draw_by_slice(model, state.parameters, ETA, evidence, generator)
 
 
@@ -659,7 +740,9 @@ def _draw_action_parameters(model, state, chosen, confidence_too, generator):  #
         uniform[rows] = model.uniform[model.pair_state[pair]]
         rows += 1
     none = state.counts[:0]
-    evidence = (none, none, costs[:rows], times[:rows], uniform[:rows])
+    evidence = Evidence(
+        none, none, costs[:rows], times[:rows], uniform[:rows], none, times[:0], times[:0]
+    )
     if not model.is_fixed[SLIP]:
         _draw_by_slice(model, state.parameters, SLIP, evidence, generator)
     if confidence_too and not model.is_fixed[ALPHA]:
@@ -670,15 +753,15 @@ def _draw_action_parameters(model, state, chosen, confidence_too, generator):  #
 def _draw_by_slice(model, parameters, parameter, evidence, generator):  # type: ignore[no-untyped-def]
     """A parameter by slice sampling (Neal 2003, stepping out) on an unbounded scale."""
     now = math.log(parameters[parameter])
-    if parameter == SLIP:
+    if parameter not in (ALPHA, ETA):
         now -= math.log1p(-parameters[parameter])
     level = _log_density(model, parameters, parameter, evidence, now)
     level -= generator.standard_exponential()
     low = now - _SLICE * generator.random()
     high = low + _SLICE
-    while _log_density(model, parameters, parameter, evidence, low) > level:
+    while low > -_FARTHEST and _log_density(model, parameters, parameter, evidence, low) > level:
         low -= _SLICE
-    while _log_density(model, parameters, parameter, evidence, high) > level:
+    while high < _FARTHEST and _log_density(model, parameters, parameter, evidence, high) > level:
         high += _SLICE
     while True:
         proposed = low + generator.random() * (high - low)
@@ -694,32 +777,35 @@ def _draw_by_slice(model, parameters, parameter, evidence, generator):  # type: 
 @njit(nogil=True, cache=True)
 def _unscaled(parameter, scaled):  # type: ignore[no-untyped-def]
     """A parameter from its logarithm, or a probability from its logit."""
-    if parameter == SLIP:
-        return min(max(1.0 / (1.0 + math.exp(-scaled)), _RAREST), 1.0 - _RAREST)
+    if parameter not in (ALPHA, ETA):
+        return 1.0 / (1.0 + math.exp(-scaled))
     return math.exp(scaled)
 
 
 @njit(nogil=True, cache=True)
 def _log_density(model, parameters, parameter, evidence, scaled):  # type: ignore[no-untyped-def]
-    """Log density of the logarithm of alpha or eta, or the logit of slip, but for a constant.
+    """Log density of the logarithm of alpha or eta, or of the logit of another parameter.
 
-    The evidence on eta: (G,) draws of each candidate, and their number in each part. That on alpha
-    and slip: costs (M, A + 1) of an action taken and of all it was chosen from, how often (M,),
-    and the probability (M,) of each action that is a slip.
+    But for a constant.
     """
     value = _unscaled(parameter, scaled)
     first, second = model.hyper[parameter]
-    if parameter == SLIP:
-        density = first * math.log(value) + second * math.log1p(-value)
-    else:
+    if parameter in (ALPHA, ETA):
         density = -0.5 * ((scaled - math.log(first)) / second) ** 2
-    counts, drawn, costs, times, uniform = evidence
+    else:
+        density = first * math.log(value) + second * math.log1p(-value)
+    counts, drawn, costs, times, uniform, changes, same, weights = evidence
     for part in range(drawn.shape[0]):
         density += math.lgamma(value) - math.lgamma(value + drawn[part])
     for candidate in range(counts.shape[0]):
         if counts[candidate] > 0:
             weight = value * model.prior[candidate]
             density += math.lgamma(weight + counts[candidate]) - math.lgamma(weight)
+    for number in changes:
+        density += number * math.log(value)
+    for candidate in range(same.shape[0]):
+        if same[candidate] > 0.0:
+            density += same[candidate] * math.log1p(value * (weights[candidate] - 1.0))
     alpha = value if parameter == ALPHA else parameters[ALPHA]
     slip = value if parameter == SLIP else parameters[SLIP]
     for row in range(costs.shape[0]):

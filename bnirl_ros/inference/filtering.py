@@ -1,0 +1,212 @@
+"""What the demonstrator is going for now, and what it will do next: filtering, draw by draw.
+
+Given the parameters and weights of a draw, the subgoal of a demonstrator that is being watched is
+the state of a hidden Markov chain. Filtering costs O(G) an observation.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from bnirl_ros.demonstrations.demonstration import Demonstration
+from bnirl_ros.errors import InputError
+from bnirl_ros.inference.posterior import Posterior, grid_world, pursuit_model_of
+from bnirl_ros.inference.pursuit_gibbs import forward_pass, kernel_model, softmax_table
+from bnirl_ros.inference.runs import run_counts
+from bnirl_ros.maps.grid_map import GridMap
+from bnirl_ros.model.pursuits import PRIORS, PursuitModel
+
+_ETA = list(PRIORS).index("eta")
+_DRAWS = 64  # of the posterior, over which a prediction is averaged
+
+
+def filtered(
+    model: PursuitModel,
+    weights: npt.NDArray[np.float64],
+    parameters: npt.NDArray[np.float64],
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """P(subgoal at t | actions up to t) (N, G), and P(action t | actions before t) (N,).
+
+    Both within the episode of t, whose first subgoal is a draw from the weights.
+
+    Args:
+        model: of the demonstration that is watched.
+        weights: (G,) probability that the next subgoal is each candidate, given that it lies in
+            the part of the map where the demonstrator is.
+        parameters: in the order of `PRIORS`.
+    """
+    kernel = kernel_model(model)
+    chosen = softmax_table(kernel, parameters[0])
+    belief = np.empty((len(model.state_of), len(weights)))
+    evidence = np.empty(len(belief))
+    bounds = [*np.flatnonzero(model.starts), len(belief)]
+    for first, end in zip(bounds[:-1], bounds[1:], strict=True):
+        here = model.candidate_part == model.state_part[model.state_of[first]]
+        forward_pass(
+            kernel,
+            parameters,
+            chosen,
+            np.where(here, weights, 0.0),
+            first,
+            end,
+            weights,  # not read
+            belief[first:end],
+            evidence[first:end],
+        )
+    return belief, evidence
+
+
+def weights_of_draws(
+    posterior: Posterior, model: PursuitModel, draws: npt.NDArray[np.int64]
+) -> npt.NDArray[np.float64]:
+    """(D, G) probability that the next subgoal is each candidate, for some draws of all chains.
+
+    The urn's, after the pursuits of the draw and the expected number of times that a subgoal was
+    drawn again while it was pursued, which draws do not record.
+
+    Args:
+        posterior: draws of the sequential model.
+        model: of the demonstration that the posterior is about.
+        draws: (D,) numbers of the draws.
+    """
+    demonstration = posterior.demonstration
+    subgoals = posterior.draws.subgoal_of.reshape(-1, len(demonstration))[draws]
+    parameters = posterior.draws.parameters.reshape(-1, len(PRIORS))[draws]
+    runs = run_counts(subgoals, demonstration.starts, len(posterior.candidates))
+    rows = np.arange(1, len(demonstration))
+    result = np.empty(runs.shape)
+    for index, (subgoal_of, values) in enumerate(zip(subgoals, parameters, strict=True)):
+        same = (subgoal_of[1:] >= 0) & (subgoal_of[1:] == subgoal_of[:-1]) & ~model.starts[1:]
+        kept, kept_at = subgoal_of[1:][same], rows[same]
+        rho = model.switch_probability(values)[kept_at, kept]
+        counts = runs[index].astype(np.float64)
+        for _ in range(5):  # a fixed point, soon near enough
+            weights = _urn_weights(model, values[_ETA], counts)
+            again = rho * weights[kept]
+            expected = again / (1.0 - rho + again)
+            counts = runs[index] + np.bincount(kept, weights=expected, minlength=len(weights))
+        result[index] = _urn_weights(model, values[_ETA], counts)
+    return result
+
+
+def _urn_weights(
+    model: PursuitModel, eta: float, counts: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """(G,) predictive weights within each part."""
+    drawn = np.bincount(model.candidate_part, weights=counts)[model.candidate_part]
+    return np.asarray((eta * model.prior + counts) / (eta + drawn))
+
+
+def log_predictive(
+    posterior: Posterior, held_out: Demonstration, grid_map: GridMap
+) -> npt.NDArray[np.float64]:
+    """Log P(action t | actions before t in its episode) (N,) of another demonstration.
+
+    Averaged over draws of the posterior, which knows nothing of that demonstration. Actions that
+    do the same, such as blocked moves, are one action.
+
+    Raises:
+        InputError: the posterior is not one of the sequential model.
+    """
+    model, numbers = _sequential(posterior, grid_map)
+    watched = pursuit_model_of(held_out, posterior.candidates, grid_map, posterior.settings)
+    parameters = posterior.draws.parameters.reshape(-1, len(PRIORS))[numbers]
+    weights = weights_of_draws(posterior, model, numbers)
+    total = np.zeros(len(held_out))
+    for values, of_draw in zip(parameters, weights, strict=True):
+        total += filtered(watched, of_draw, values)[1]
+    return np.asarray(np.log(total / len(numbers)))
+
+
+def _sequential(
+    posterior: Posterior, grid_map: GridMap
+) -> tuple[PursuitModel, npt.NDArray[np.int64]]:
+    """The model of a posterior's demonstration, and the numbers of evenly spaced draws."""
+    if posterior.settings.model != "sequential":
+        raise InputError("only the sequential model can be filtered; infer with it")
+    model = pursuit_model_of(
+        posterior.demonstration, posterior.candidates, grid_map, posterior.settings
+    )
+    count = posterior.draws.log_joint.size
+    return model, np.unique(np.linspace(0, count - 1, _DRAWS).astype(np.int64))
+
+
+class SubgoalFilter:
+    """Watches a demonstrator and tells, action by action, what it is going for now.
+
+    With the posterior medians of parameters and weights. Holds the action likelihoods of all free
+    cells: their number times that of actions times that of candidates.
+    """
+
+    def __init__(self, posterior: Posterior, grid_map: GridMap) -> None:
+        """A filter for a demonstrator like the one of a posterior, on the same map.
+
+        Raises:
+            InputError: the posterior is not one of the sequential model.
+        """
+        model, numbers = _sequential(posterior, grid_map)
+        self._parameters = np.median(posterior.draws.parameters.reshape(-1, len(PRIORS)), axis=0)
+        self._weights = weights_of_draws(posterior, model, numbers).mean(axis=0)
+        self.candidates = posterior.candidates
+        self._world = grid_world(grid_map, posterior.settings)
+        reachable = np.isin(
+            self._world.parts_of(np.flatnonzero(self._world.free)),
+            self._world.parts_of(self._world.states_of(self.candidates)),
+        )
+        states = np.flatnonzero(self._world.free)[reachable]
+        actions = self._world.actions
+        every = Demonstration(
+            episode=np.zeros(len(states) * len(actions), dtype=np.int64),
+            cells=self._world.cells_of(np.repeat(states, len(actions))),
+            action=np.tile(actions, len(states)),
+            last_episode=np.empty(0, dtype=np.int64),
+            last_cells=np.empty((0, 2), dtype=np.int64),
+        )
+        self._model = pursuit_model_of(every, self.candidates, grid_map, posterior.settings)
+        self._kernel = kernel_model(self._model)
+        self._chosen = softmax_table(self._kernel, self._parameters[0])
+        self._row_of_state = {int(state): row for row, state in enumerate(states)}
+        self._belief: npt.NDArray[np.float64] | None = None
+        self._row = 0
+
+    def begin_episode(self) -> None:
+        """The next action is the first one of an episode."""
+        self._belief = None
+
+    def observe(self, cell: npt.ArrayLike, action: int) -> npt.NDArray[np.float64]:
+        """P(subgoal now | actions of this episode so far) (G,), after one more of them.
+
+        Args:
+            cell: (x, y) in which the action was chosen.
+            action: index into `ACTION_NAMES`.
+
+        Raises:
+            InputError: the cell is not free, or no candidate can be reached from it.
+        """
+        row = self._row_of_state.get(int(self._world.states_of(cell)[0]))
+        if row is None:
+            raise InputError(f"cell {cell}: no candidate can be reached from it")
+        actions = self._world.actions
+        pair = self._kernel.pair_of[row * len(actions) + np.searchsorted(actions, action)]
+        starts = self._belief is None
+        here = self._model.candidate_part == self._model.state_part[row]
+        weights = np.where(here, self._weights, 0.0)
+        after = np.empty((1, len(weights)))
+        forward_pass(
+            self._kernel._replace(
+                state_of=np.array([self._row, row]),
+                pair_of=np.array([0, pair]),
+                starts=np.array([False, starts]),
+            ),
+            self._parameters,
+            self._chosen,
+            weights,
+            1,
+            2,
+            weights if self._belief is None else self._belief,
+            after,
+            np.empty(1),
+        )
+        self._belief, self._row = after[0], row
+        return self._belief.copy()
