@@ -28,6 +28,9 @@ from bnirl_ros.mdp.actions import ACTION_NAMES
 LAYOUTS = ("random3", "asymmetric_advantages", "coordination_ring")
 """Layouts whose human play the project measures itself against."""
 
+MOVES = 4
+"""Players move to the sides only."""
+
 STEP = 0.15
 """Time between two poses in a bag [s]: a step of the game. As no pose is there for the steps that
 are left out, the time that a player waits is not in the bag."""

@@ -6,6 +6,8 @@ the state of a hidden Markov chain. Filtering costs O(G) an observation.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import numpy.typing as npt
 
@@ -41,7 +43,7 @@ def filtered(
     belief = np.empty((len(model.state_of), len(weights)))
     evidence = np.empty(len(belief))
     bounds = [*np.flatnonzero(model.starts), len(belief)]
-    for first, end in zip(bounds[:-1], bounds[1:], strict=True):
+    for first, end in pairwise(bounds):
         here = model.candidate_part == model.state_part[model.state_of[first]]
         forward_pass(
             kernel,

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from bnirl_ros.experiments.interactions import shares
 from bnirl_ros.experiments.overcooked import (
     LAYOUTS,
+    MOVES,
     read_interactions,
     read_overcooked,
     read_paths,
@@ -79,7 +80,7 @@ BASELINES = {"dwell time": rank_by_dwell, "visits": rank_by_visits, "stays": ran
 def rank_by_model(recordings: Path, layout: str, model: str) -> list[Cell]:
     """The subgoals of a model's mode by rank."""
     demonstration, grid_map = read_overcooked(recordings, layout)
-    summary = summarise(infer(demonstration, grid_map, settings_of(model)), grid_map)
+    summary = summarise(infer(demonstration, grid_map, settings_of(model, moves=MOVES)), grid_map)
     return [subgoal.cell for subgoal in summary.subgoals]
 
 

@@ -15,9 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from bnirl_ros.demonstrations.demonstration import Demonstration
-from bnirl_ros.experiments.overcooked import LAYOUTS, read_overcooked
+from bnirl_ros.experiments.overcooked import LAYOUTS, MOVES, read_overcooked
 from bnirl_ros.experiments.study.part import MODELS, Part, settings_of
 from bnirl_ros.experiments.study.report import Table
+from bnirl_ros.inference.filtering import log_predictive
 from bnirl_ros.inference.posterior import Posterior, grid_world, infer
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.maps import GridMap
@@ -34,7 +35,7 @@ class Predictor(Protocol):
     def __call__(
         self, posterior: Posterior, held_out: Demonstration, grid_map: GridMap, settings: Settings
     ) -> npt.NDArray[np.float64]:
-        """(N,) log P(a_t | s_1..s_t, a_1..a_(t-1)) of each action, from its episode's start."""
+        """(N,) log P of each action's outcome given its episode so far."""
         ...
 
 
@@ -52,19 +53,30 @@ def predict_exchangeable(
         world.states_of(held_out.cells),
         held_out.action,
         world.states_of(posterior.candidates),
-        settings.alpha,
-        settings.eta,
+        **settings.fixed,
     )
     drawn = posterior.draws.subgoal_of.reshape(-1)
     count = np.bincount(drawn, minlength=len(posterior.candidates)) / (
         len(drawn) / len(posterior.demonstration)
     )
     prior = np.exp(mixture.log_prior)
-    weights = (count + settings.eta * prior) / (len(posterior.demonstration) + settings.eta)
-    return np.asarray(np.log(np.exp(mixture.log_likelihood) @ weights)[mixture.pair_of])
+    weights = (count + mixture.eta * prior) / (len(posterior.demonstration) + mixture.eta)
+    of_action = np.log(np.exp(mixture.log_likelihood) @ weights)[mixture.pair_of]
+    # Actions with the same outcome are equally probable.
+    return np.asarray(of_action + np.log(actions_alike(held_out, world)))
 
 
-PREDICTORS: dict[str, Predictor] = {"paper": predict_exchangeable}
+def predict_in_sequence(
+    posterior: Posterior, held_out: Demonstration, grid_map: GridMap, settings: Settings
+) -> npt.NDArray[np.float64]:
+    """(N,) the sequential model's prediction, to which such actions are one action."""
+    return log_predictive(posterior, held_out, grid_map)
+
+
+PREDICTORS: dict[str, Predictor] = {
+    "sequential": predict_in_sequence,
+    "paper": predict_exchangeable,
+}
 """How each model foresees. A model that none is given for has no row."""
 
 
@@ -76,10 +88,7 @@ def outcomes_of(demonstration: Demonstration, world: GridWorld) -> npt.NDArray[n
 
 
 def actions_alike(demonstration: Demonstration, world: GridWorld) -> npt.NDArray[np.int64]:
-    """(N,) how many actions of its state have the outcome of an observation's own.
-
-    Every model gives these the same probability, that of a single one of them.
-    """
+    """(N,) how many actions of its state have the outcome of an observation's own."""
     states, outcomes = outcomes_of(demonstration, world).T
     return np.asarray((world.outcomes()[states] == outcomes[:, None]).sum(axis=1))
 
@@ -148,13 +157,12 @@ def run(case: Case) -> dict[str, Any]:
     demonstration, grid_map = read_overcooked(case.recordings, case.layout)
     learnt, held_out = split_trials(demonstration)
     if case.by in BASELINES:
-        world = grid_world(grid_map, Settings())
+        world = grid_world(grid_map, Settings(moves=MOVES))
         foreseen = BASELINES[case.by](learnt, held_out, world)
     else:
-        settings = settings_of(case.by)
+        settings = settings_of(case.by, moves=MOVES)
         posterior = infer(learnt, grid_map, settings)
         foreseen = PREDICTORS[case.by](posterior, held_out, grid_map, settings)
-        foreseen = foreseen + np.log(actions_alike(held_out, grid_world(grid_map, settings)))
     return {
         "layout": case.layout,
         "by": case.by,

@@ -25,6 +25,7 @@ from bnirl_ros.inference.summary import summarise
 from bnirl_ros.maps import GridMap
 from bnirl_ros.mdp.goal_values import goal_values
 from bnirl_ros.model.likelihood import action_log_likelihood
+from bnirl_ros.model.pursuits import pursuit_model
 
 DEMONSTRATIONS = 2000
 """For each model."""
@@ -48,7 +49,8 @@ Simulator = Callable[[np.random.Generator], tuple[Demonstration, GridMap, list[C
 _MAP = GridMap(
     np.array([[cell == "." for cell in row] for row in ("......", ".##...", "...#..", "......")])
 )
-_OBSERVATIONS = 40
+_OBSERVATIONS = 40  # of each episode
+_EPISODES = 2  # of a demonstrator who pursues subgoals in sequence
 
 
 def simulate_exchangeable(
@@ -58,11 +60,12 @@ def simulate_exchangeable(
     settings = Settings(model="paper")
     world = grid_world(_MAP, settings)
     free = np.flatnonzero(world.free)
-    policies = np.exp(action_log_likelihood(goal_values(world, free, free), settings.alpha))
+    alpha, eta = settings.fixed["alpha"], settings.fixed["eta"]
+    policies = np.exp(action_log_likelihood(goal_values(world, free, free), alpha))
     states = generator.integers(len(free), size=_OBSERVATIONS)
     subgoals: list[int] = []
     for seen in range(_OBSERVATIONS):
-        place = generator.random() * (seen + settings.eta)
+        place = generator.random() * (seen + eta)
         old = place < seen
         subgoals.append(subgoals[int(place)] if old else int(generator.integers(len(free))))
     choices = [
@@ -80,7 +83,64 @@ def simulate_exchangeable(
     return demonstration, _MAP, [(int(x), int(y)) for x, y in truth]
 
 
-SIMULATORS: dict[str, Simulator] = {"paper": simulate_exchangeable}
+def simulate_in_sequence(
+    generator: np.random.Generator,
+) -> tuple[Demonstration, GridMap, list[Cell]]:
+    """From the prior of the sequential model: parameters, pursuits, slips, and where they lead.
+
+    A subgoal that only slips pursued is none: no posterior counts it as one either.
+    """
+    world = grid_world(_MAP, Settings())
+    free = np.flatnonzero(world.free)
+    every = pursuit_model(world, free, np.zeros(len(free)), np.arange(len(free)) == 0, free)
+    parameters = np.array([prior.draw(generator) for prior in every.priors.values()])
+    _, eta, slip, on_arrival, at_subgoal, elsewhere = parameters
+    parameters[2] = 0.0
+    policies = every.action_likelihood(parameters)
+    outcomes = world.outcomes()
+
+    draws: list[int] = []
+    states, choices, explaining = [], [], set()
+    row = subgoal = -1
+    for t in range(_EPISODES * _OBSERVATIONS):
+        if t % _OBSERVATIONS == 0:
+            row, rho = int(generator.integers(len(free))), 1.0
+        elif row != subgoal:
+            rho = elsewhere
+        else:
+            rho = at_subgoal if states[-1] == row else on_arrival
+        if generator.random() < rho:
+            place = generator.random() * (len(draws) + eta)
+            old = place < len(draws)
+            draws.append(draws[int(place)] if old else int(generator.integers(len(free))))
+            subgoal = draws[-1]
+        distinct = np.isfinite(every.cost[row, :, 0])
+        if generator.random() < slip:
+            policy = distinct / distinct.sum()
+        else:
+            policy = policies[row, :, subgoal]
+            explaining.add(subgoal)
+        choice = int(generator.choice(len(policy), p=policy))
+        states.append(row)
+        choices.append(choice)
+        others = np.delete(np.arange(len(policy)), choice)
+        happens = choice if generator.random() < world.success else generator.choice(others)
+        row = int(np.searchsorted(free, outcomes[free[row], happens]))
+    demonstration = Demonstration(
+        episode=np.repeat(np.arange(_EPISODES), _OBSERVATIONS),
+        cells=world.cells_of(free[states]),
+        action=world.actions[choices],
+        last_episode=np.empty(0, dtype=np.int64),
+        last_cells=np.empty((0, 2), dtype=np.int64),
+    )
+    truth = world.cells_of(free[sorted(explaining)])
+    return demonstration, _MAP, [(int(x), int(y)) for x, y in truth]
+
+
+SIMULATORS: dict[str, Simulator] = {
+    "sequential": simulate_in_sequence,
+    "paper": simulate_exchangeable,
+}
 """A demonstrator from each model's own prior. A model that none is given for has no rows."""
 
 

@@ -26,6 +26,10 @@ REACH = 0.75
 drive itself passes the waypoints at up to half a metre."""
 
 
+SEEDS = 10
+"""Inferences by each model."""
+
+
 @dataclass(frozen=True)
 class WaypointScore:
     """How subgoals compare with the author's waypoints.
@@ -70,16 +74,25 @@ def score(summary: Summary) -> WaypointScore:
 
 def _ranks_visited(summary: Summary) -> Sequence[int]:
     if summary.pursuits:
-        return [pursuit.rank for pursuit in summary.pursuits]
+        return [pursuit.rank for pursuit in summary.pursuits if pursuit.arrived]
     return summary.visit_sequence
 
 
-def run(model: str) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Case:
+    """A model with a seed."""
+
+    model: str
+    seed: int
+
+
+def run(case: Case) -> dict[str, Any]:
     """The score of a model."""
     demonstration, grid_map = drive()
-    summary = summarise(infer(demonstration, grid_map, settings_of(model)), grid_map)
+    settings = settings_of(case.model, seed=case.seed)
+    summary = summarise(infer(demonstration, grid_map, settings), grid_map)
     return {
-        "model": model,
+        **asdict(case),
         "positions": [subgoal.position for subgoal in summary.subgoals],
         **asdict(score(summary)),
     }
@@ -87,28 +100,36 @@ def run(model: str) -> dict[str, Any]:
 
 def table(results: Sequence[dict[str, Any]]) -> Table:
     """A row for each model."""
+    rows = []
+    for model in dict.fromkeys(result["model"] for result in results):
+        mine = [result for result in results if result["model"] == model]
+        rows.append(
+            (
+                model,
+                f"{_range(mine, 'found')} of {len(WAYPOINTS)}",
+                _range(mine, "strays"),
+                _range(mine, "duplicates"),
+                f"{sum(result['in_order'] for result in mine)} of {len(mine)} times",
+            )
+        )
     return Table(
         title="A turtle driven round six waypoints",
         text=f"`{BAG}`: waypoints with a subgoal within {REACH} m, the subgoals that are at none "
         "of them or are a further one at the same, and whether those found are visited in the "
-        "author's order, from wherever.",
+        f"author's order, from wherever; least and most with the seeds 0 to {SEEDS - 1}.",
         header=("model", "waypoints found", "at none", "further ones at the same", "in order"),
-        rows=tuple(
-            (
-                result["model"],
-                f"{result['found']} of {len(WAYPOINTS)}",
-                str(result["strays"]),
-                str(result["duplicates"]),
-                "yes" if result["in_order"] else "no",
-            )
-            for result in results
-        ),
+        rows=tuple(rows),
     )
 
 
-def cases(recordings: Path) -> Sequence[str]:
+def _range(results: Sequence[dict[str, Any]], name: str) -> str:
+    values = sorted({result[name] for result in results})
+    return str(values[0]) if len(values) == 1 else f"{values[0]}-{values[-1]}"
+
+
+def cases(recordings: Path) -> Sequence[Case]:
     """The models; the bag comes with the package."""
-    return MODELS
+    return [Case(model, seed) for model in MODELS for seed in range(SEEDS)]
 
 
 PART = Part(name="turtle", cases=cases, run=run, table=table)
