@@ -8,10 +8,11 @@ A sweep draws, each given all else:
    integrated out: held as a variable they would keep a candidate that is in no pursuit from ever
    being tried. A switch depends on the old subgoal through rho alone, so that an observation costs
    O(G), not O(G^2). Blocks differ in length from sweep to sweep;
-2. partitions, given the subgoals, by the Chinese restaurant process that the urn collapses, and
+2. the switch probabilities, together with the switches to the same subgoal again, and eta, all
+   parameters by slice sampling;
+3. partitions, given the subgoals, by the Chinese restaurant process that the urn collapses, and
    the subgoal of each partition anew: whole groups of pursuits move at once;
-3. the parameters by slice sampling: those of switches together with the switches to the same
-   subgoal again, that of slips while it is open which actions are slips.
+4. alpha and the probability of a slip, while it is open which actions are slips.
 """
 
 from __future__ import annotations
@@ -232,9 +233,11 @@ def _advance(model, state, generator, thin, subgoal_of, partition_of, log_joint,
     for draw in range(log_joint.shape[0]):
         for _ in range(thin):
             _draw_blocks(model, state, chosen, forward, generator)
-            _draw_groups(model, state, chosen, generator)
+            # Partitions depend on eta and on the switches, whose draws have them integrated out:
+            # they come after these.
             _draw_switches(model, state, generator)
             _draw_concentration(model, state, generator)
+            _draw_groups(model, state, chosen, generator)
             confidence_too = state.sweeps[0] % period == 0
             _draw_action_parameters(model, state, chosen, confidence_too, generator)
             if confidence_too and not model.is_fixed[ALPHA]:
