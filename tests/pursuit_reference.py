@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -201,3 +202,78 @@ class PursuitEnumeration:
         self.partition_count /= total
         self.switched /= total
         self.log_evidence = float(np.log(total))
+
+
+class Story(NamedTuple):
+    """What the model tells of a demonstration, drawn from its prior.
+
+    Attributes:
+        subgoal_of: (N,) subgoal that is pursued at each observation.
+        switched: (N,) bool whether it is a draw of its own.
+        partition_of: (N,) partition of that draw, numbered from 0.
+        slipped: (N,) bool whether the action is a slip.
+    """
+
+    subgoal_of: npt.NDArray[np.int64]
+    switched: npt.NDArray[np.bool_]
+    partition_of: npt.NDArray[np.int64]
+    slipped: npt.NDArray[np.bool_]
+
+
+def parameters_drawn(model: PursuitModel, generator: np.random.Generator) -> Parameters:
+    """The parameters from their priors, or their fixed values."""
+    return np.array(
+        [
+            model.fixed[name] if name in model.fixed else model.priors[name].draw(generator)
+            for name in PRIORS
+        ]
+    )
+
+
+def story_drawn(
+    model: PursuitModel, parameters: Parameters, generator: np.random.Generator
+) -> Story:
+    """Switches by rho, subgoals from a Chinese restaurant process in each part, then slips."""
+    count = len(model.state_of)
+    subgoal_of = np.zeros(count, dtype=np.int64)
+    switched = np.zeros(count, dtype=np.bool_)
+    partition_of = np.zeros(count, dtype=np.int64)
+    subgoals: list[int] = []  # of each partition
+    sizes: list[int] = []
+    for t, state in enumerate(model.state_of):
+        rho = switch_probability(model, parameters, t, subgoal_of[t - 1])
+        switched[t] = generator.random() < rho
+        if not switched[t]:
+            subgoal_of[t], partition_of[t] = subgoal_of[t - 1], partition_of[t - 1]
+            continue
+        part = model.state_part[state]
+        weights = np.array(
+            [
+                size * (model.candidate_part[g] == part)
+                for size, g in zip(sizes, subgoals, strict=True)
+            ]
+            + [parameters[1]]
+        )
+        partition = int(generator.choice(len(weights), p=weights / weights.sum()))
+        if partition == len(sizes):
+            sizes.append(0)
+            subgoals.append(int(generator.choice(np.flatnonzero(model.candidate_part == part))))
+        sizes[partition] += 1
+        subgoal_of[t], partition_of[t] = subgoals[partition], partition
+    return Story(subgoal_of, switched, partition_of, generator.random(count) < parameters[2])
+
+
+def actions_drawn(
+    model: PursuitModel,
+    parameters: Parameters,
+    subgoal_of: npt.NDArray[np.integer],
+    slipped: npt.NDArray[np.bool_],
+    generator: np.random.Generator,
+) -> npt.NDArray[np.int64]:
+    """(N,) actions, each uniform if it is a slip, and else from the softmax."""
+    costs = model.cost[model.state_of, :, subgoal_of]
+    weights = np.exp(-parameters[0] * costs)
+    weights[slipped] = np.isfinite(costs[slipped])
+    cumulative = np.cumsum(weights, axis=1)
+    aim = generator.random(len(costs)) * cumulative[:, -1]
+    return (aim[:, None] >= cumulative).sum(axis=1)

@@ -7,6 +7,7 @@ anew, are stated beside the bounds.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,12 +16,19 @@ import pytest
 from numba import njit
 
 from bnirl_ros.inference import pursuit_gibbs
+from bnirl_ros.inference.diagnostics import effective_sample_size
 from bnirl_ros.inference.draws import Draws
-from bnirl_ros.inference.runs import run_counts
+from bnirl_ros.inference.runs import run_counts, runs
 from bnirl_ros.mdp.grid_world import GridWorld
 from bnirl_ros.model.mixture import SubgoalMixture, subgoal_mixture
 from bnirl_ros.model.pursuits import PRIORS, PursuitModel, pursuit_model
-from pursuit_reference import PursuitEnumeration
+from pursuit_reference import (
+    PursuitEnumeration,
+    Story,
+    actions_drawn,
+    parameters_drawn,
+    story_drawn,
+)
 from reference import set_partitions
 from test_exactness import CASES as PAPER_CASES
 from test_exactness import total_variations as mixture_variations
@@ -222,3 +230,120 @@ def both_models(case: tuple) -> tuple[SubgoalMixture, PursuitModel]:  # type: ig
         fixed=dict(zip(PRIORS, (alpha, eta, 0.0, 1.0, 1.0, 1.0), strict=True)),
     )
     return subgoal_mixture(world, states, actions, goals, alpha, eta), model
+
+
+# Geweke (2004): if the sampler leaves the posterior as it is, then sweeps that alternate with
+# drawing the actions anew leave the joint prior as it is. States and candidates stay fixed.
+
+
+def wanderings(
+    free: npt.NDArray[np.bool_], moves: int, lengths: tuple[int, ...], seed: int
+) -> PursuitModel:
+    """A model of episodes of these lengths that wander, all free cells candidates; all inferred.
+
+    The actions are placeholders for those that tests draw.
+    """
+    generator = np.random.default_rng(seed)
+    world = GridWorld(free, moves)
+    goals, outcomes = np.flatnonzero(free), world.outcomes()
+    states = []
+    for length in lengths:
+        state = generator.choice(goals)
+        for _ in range(length):
+            states.append(state)
+            state = generator.choice(outcomes[state])
+    starts = np.isin(np.arange(len(states)), np.cumsum((0, *lengths)))
+    return pursuit_model(world, states, np.zeros(len(states)), starts, goals)
+
+
+class Told(NamedTuple):
+    """Everything that is drawn: parameters, the story of the subgoals, and the actions."""
+
+    parameters: npt.NDArray[np.float64]
+    story: Story
+    model: PursuitModel
+
+
+def told_by_prior(model: PursuitModel, generator: np.random.Generator) -> Told:
+    parameters = parameters_drawn(model, generator)
+    story = story_drawn(model, parameters, generator)
+    actions = actions_drawn(model, parameters, story.subgoal_of, story.slipped, generator)
+    return Told(parameters, story, replace(model, action_of=actions))
+
+
+MEAN_LOG = np.log(3.0)  # of alpha and of eta, by their priors
+
+
+def functionals(told: Told) -> dict[str, float]:
+    """Scalars of (parameters, story, actions) whose mean under the joint is compared."""
+    alpha, eta, slip, on_arrival, at_subgoal, elsewhere = told.parameters
+    subgoal_of, switched, partition_of, slipped = told.story
+    explained = np.where(slipped, -1, subgoal_of)
+    subgoals, partitions = np.unique(subgoal_of).size, np.unique(partition_of).size
+    return {
+        "log alpha": np.log(alpha),
+        "spread of alpha": (np.log(alpha) - MEAN_LOG) ** 2,
+        "log eta": np.log(eta),
+        "spread of eta": (np.log(eta) - MEAN_LOG) ** 2,
+        "slip": slip,
+        "switch on arrival": on_arrival,
+        "switch at subgoal": at_subgoal,
+        "switch elsewhere": elsewhere,
+        "pursuits": len(runs(explained, told.model.starts)[0]),
+        "switches": switched.sum(),
+        "slips": slipped.sum(),
+        "subgoals": subgoals,
+        "partitions": partitions,
+        "partitions by eta": (partitions - subgoals) * (np.log(eta) - MEAN_LOG),
+        "subgoals by eta": subgoals * (np.log(eta) - MEAN_LOG),
+        "slips by alpha": slipped.sum() * (np.log(alpha) - MEAN_LOG),
+        "switches by rho": switched.sum() * elsewhere,
+        "first subgoal": subgoal_of[0] == len(told.model.prior) - 1,
+        "a subgoal": (explained == 1).any(),
+        "first and last together": partition_of[0] == partition_of[-1],
+        "stays": (told.model.action_of == 0).sum(),
+        "log joint": told.model.log_joint(subgoal_of, switched, told.parameters),
+    }
+
+
+GEWEKE_CASES = {
+    "open": (np.ones((3, 3), dtype=bool), 8, (11, 3), 9),
+    "two parts": (np.array([[1, 1, 1, 0, 1, 1]], dtype=bool), 4, (6, 4, 5), 3),
+}
+
+
+@pytest.mark.parametrize("name", GEWEKE_CASES)
+def test_geweke_joint_distribution(name: str) -> None:
+    # Twenty-two functionals, two cases, |z| <= 4.5: a false alarm once in 3,000 runs. Effective
+    # sizes: from some 400 (a single subgoal) to nearly all rounds (partitions by eta).
+    rounds = 8_000
+    model = wanderings(*GEWEKE_CASES[name])
+    generator = np.random.default_rng(12)
+    independent = [
+        list(functionals(told_by_prior(model, generator)).values()) for _ in range(rounds)
+    ]
+    told = told_by_prior(model, generator)
+    state = pursuit_gibbs.initial_state(told.model, generator)
+    last = pursuit_gibbs.room_for(model, (1,))
+    successive = []
+    for _ in range(rounds):
+        # Alpha is drawn in every fourth sweep.
+        pursuit_gibbs.advance(told.model, state, generator, last, thin=4)
+        story = Story(
+            state.subgoal_of.astype(np.int64),
+            state.switched.copy(),
+            state.partition_of.astype(np.int64),
+            state.slipped.copy(),
+        )
+        actions = actions_drawn(
+            model, state.parameters, state.subgoal_of, state.slipped, generator
+        )
+        told = Told(state.parameters.copy(), story, replace(model, action_of=actions))
+        successive.append(list(functionals(told).values()))
+    values, chain = np.array(independent, dtype=float), np.array(successive, dtype=float)
+    sizes = [effective_sample_size(chain[None, :, index]) for index in range(chain.shape[1])]
+    errors = np.sqrt(values.var(axis=0) / rounds + chain.var(axis=0) / np.array(sizes))
+    scores = dict(
+        zip(functionals(told), (chain.mean(axis=0) - values.mean(axis=0)) / errors, strict=True)
+    )
+    assert max(map(abs, scores.values())) <= 4.5, scores
