@@ -76,12 +76,11 @@ def weights_of_draws(
     subgoals = posterior.draws.subgoal_of.reshape(-1, len(demonstration))[draws]
     parameters = posterior.draws.parameters.reshape(-1, len(PRIORS))[draws]
     runs = run_counts(subgoals, demonstration.starts, len(posterior.candidates))
-    rows = np.arange(1, len(demonstration))
     result = np.empty(runs.shape)
     for index, (subgoal_of, values) in enumerate(zip(subgoals, parameters, strict=True)):
         same = (subgoal_of[1:] >= 0) & (subgoal_of[1:] == subgoal_of[:-1]) & ~model.starts[1:]
-        kept, kept_at = subgoal_of[1:][same], rows[same]
-        rho = model.switch_probability(values)[kept_at, kept]
+        kept = subgoal_of[1:][same]
+        rho = model.switch_probability(subgoal_of, values)[1:][same]
         counts = runs[index].astype(np.float64)
         for _ in range(5):  # a fixed point, soon near enough
             weights = _urn_weights(model, values[_ETA], counts)

@@ -179,27 +179,37 @@ def _extended(
     parameters: npt.NDArray[np.float64],
     generator: np.random.Generator,
 ) -> PursuitState:
-    """A state with a subgoal wherever there was none (-1), and the switches that this takes."""
-    for t in range(len(subgoal_of)):
-        part = model.state_part[model.state_of[t]]
-        if subgoal_of[t] >= 0 and model.candidate_part[subgoal_of[t]] != part:
-            subgoal_of[t] = -1  # the map has changed
-        if subgoal_of[t] < 0 and not model.starts[t]:
-            subgoal_of[t] = subgoal_of[t - 1]
-        elif subgoal_of[t] < 0:
-            subgoal_of[t] = generator.choice(np.flatnonzero(model.candidate_part == part))
-    changes = np.diff(subgoal_of, prepend=np.int32(-1)) != 0
-    switched = switched | changes
-    # A switch cannot have happened, or not happened, where its probability says so.
-    rho = model.switch_probability(parameters)[np.arange(len(subgoal_of)), np.roll(subgoal_of, 1)]
-    switched |= rho == 1.0
+    """A state with a subgoal wherever there was none (-1): that before it, or one by chance."""
+    part = model.state_part[model.state_of]
+    subgoals = np.where(model.candidate_part[subgoal_of] == part, subgoal_of, np.int32(-1))
+    for t in np.flatnonzero(model.starts & (subgoals < 0)):
+        subgoals[t] = generator.choice(np.flatnonzero(model.candidate_part == part[t]))
+    return state_of(model, filled_forward(subgoals), switched, parameters)
+
+
+def filled_forward(subgoal_of: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+    """(N,) each subgoal that is missing (negative) like the last one before it, if there is."""
+    rows = np.where(subgoal_of >= 0, np.arange(len(subgoal_of)), 0)
+    return subgoal_of[np.maximum.accumulate(rows)]
+
+
+def state_of(
+    model: PursuitModel,
+    subgoal_of: npt.NDArray[np.int32],
+    switched: npt.NDArray[np.bool_],
+    parameters: npt.NDArray[np.float64],
+) -> PursuitState:
+    """A state from subgoals (N,), with the switches (N,) that are known and those they take."""
+    switched = switched | model.starts | (np.diff(subgoal_of, prepend=subgoal_of[:1]) != 0)
+    # Where a switch is certain, it has happened.
+    switched |= model.switch_probability(subgoal_of, parameters) == 1.0
     return PursuitState(
         subgoal_of=subgoal_of,
         switched=switched,
         slipped=np.zeros(len(subgoal_of), dtype=np.bool_),
         partition_of=np.zeros(len(subgoal_of), dtype=np.int32),
         counts=np.bincount(subgoal_of[switched], minlength=len(model.prior)).astype(np.int64),
-        parameters=parameters,
+        parameters=np.array(parameters, dtype=np.float64),
         sweeps=np.zeros(1, dtype=np.int64),
     )
 

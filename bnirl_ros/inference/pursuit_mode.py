@@ -22,13 +22,14 @@ from bnirl_ros.inference.pursuit_gibbs import (
     ELSEWHERE,
     ETA,
     SLIP,
-    PursuitState,
+    filled_forward,
     group_scores,
     kernel_model,
     likelihood,
     log_joint_of,
     near,
     softmax_table,
+    state_of,
     switch_probability,
     urn_ratio,
     urn_weights,
@@ -73,19 +74,11 @@ def ascend(
             taken for part of the pursuit around it.
         parameters: in the order of `PRIORS`.
     """
-    subgoals = _persisting(np.asarray(subgoal_of, dtype=np.int32), model)
-    switched = model.starts | (np.diff(subgoals, prepend=subgoals[:1]) != 0)
-    rho = model.switch_probability(parameters)[np.arange(len(subgoals)), np.roll(subgoals, 1)]
-    switched |= rho == 1.0
-    state = PursuitState(
-        subgoal_of=subgoals,
-        switched=switched,
-        slipped=np.zeros(len(subgoals), dtype=np.bool_),
-        partition_of=np.zeros(len(subgoals), dtype=np.int32),
-        counts=np.bincount(subgoals[switched], minlength=len(model.prior)).astype(np.int64),
-        parameters=np.array(parameters, dtype=np.float64),
-        sweeps=np.zeros(1, dtype=np.int64),
+    given = np.asarray(subgoal_of, dtype=np.int32)
+    subgoals = filled_forward(
+        np.where(model.starts & (given < 0), _next_known(given, model), given)
     )
+    state = state_of(model, subgoals, model.starts, parameters)
     value, slipped = _ascend(kernel_model(model), state)
     labels, first, number = np.unique(
         np.where(slipped, -1, subgoals), return_index=True, return_inverse=True
@@ -98,18 +91,13 @@ def ascend(
     )
 
 
-def _persisting(subgoal_of: npt.NDArray[np.int32], model: PursuitModel) -> npt.NDArray[np.int32]:
-    """(N,) each slip with the subgoal before it, at the beginning of an episode that after it."""
-    subgoals = subgoal_of.copy()
-    for t in range(len(subgoals)):
-        if subgoals[t] < 0 and not model.starts[t]:
-            subgoals[t] = subgoals[t - 1]
-    for t in range(len(subgoals) - 1, -1, -1):
-        if subgoals[t] < 0:
-            last = t == len(subgoals) - 1 or bool(model.starts[t + 1])
-            here = model.candidate_part == model.state_part[model.state_of[t]]
-            subgoals[t] = here.argmax() if last else subgoals[t + 1]
-    return subgoals
+def _next_known(subgoal_of: npt.NDArray[np.int32], model: PursuitModel) -> npt.NDArray[np.int32]:
+    """(N,) the next subgoal that is known; one that can be reached if there is none."""
+    later = filled_forward(subgoal_of[::-1])[::-1]
+    part = model.state_part[model.state_of]
+    found = (later >= 0) & (model.candidate_part[later] == part)
+    _, of_part = np.unique(model.candidate_part, return_index=True)
+    return np.where(found, later, of_part[part]).astype(np.int32)
 
 
 @njit(nogil=True, cache=True)

@@ -123,14 +123,21 @@ class PursuitModel:
         uniform = np.isfinite(self.cost) * self.uniform[:, None, None]
         return np.asarray((1.0 - slip) * chosen + slip * uniform)
 
-    def switch_probability(self, parameters: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """(N, G) rho before each observation, by the subgoal until then; 1 at a start."""
+    def switch_probability(
+        self, subgoal_of: npt.NDArray[np.int_], parameters: npt.NDArray[np.float64]
+    ) -> npt.NDArray[np.float64]:
+        """(N,) rho before each observation, by the subgoal before it; 1 at a start.
+
+        Args:
+            subgoal_of: (N,) candidate index theta of each observation's subgoal.
+            parameters: in the order of `PRIORS`.
+        """
         on_arrival, at_subgoal, elsewhere = parameters[3:]
-        here = self.arrived[self.state_of]
-        before = np.roll(here, 1, axis=0)
-        rho = np.where(here, np.where(before, at_subgoal, on_arrival), elsewhere)
-        rho[self.starts] = 1.0
-        return rho
+        before = np.roll(subgoal_of, 1)
+        here = self.arrived[self.state_of, before]
+        there_already = self.arrived[np.roll(self.state_of, 1), before]
+        rho = np.where(here, np.where(there_already, at_subgoal, on_arrival), elsewhere)
+        return np.where(self.starts, 1.0, rho)
 
     def log_joint(
         self,
@@ -148,7 +155,7 @@ class PursuitModel:
         subgoals, switched = np.asarray(subgoal_of), np.asarray(switched, dtype=np.bool_)
         likelihood = self.action_likelihood(parameters)
         probability = likelihood[self.state_of, self.action_of, subgoals]
-        rho = self.switch_probability(parameters)[np.arange(len(subgoals)), np.roll(subgoals, 1)]
+        rho = self.switch_probability(subgoals, parameters)
         eta = parameters[1]
         counts = np.bincount(subgoals[switched], minlength=len(self.prior))
         with np.errstate(divide="ignore"):
