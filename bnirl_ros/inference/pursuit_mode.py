@@ -150,17 +150,18 @@ def _log_likelihood(model, parameters, chosen):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True)
 def _replacements(model, state, chosen, candidate):  # type: ignore[no-untyped-def]
-    """-1, and the candidates that suit the pursuits of one best."""
+    """-1, and the candidates that suit the pursuits of one best; none for the only one there."""
     state.partition_of[:] = 1
     for t in range(state.subgoal_of.shape[0]):
         if state.subgoal_of[t] == candidate:
             state.partition_of[t] = 0
     scores = group_scores(model, state, chosen, 2)[0]
-    replacements = [-1]
-    for other in scores.argsort()[::-1][:_REPLACEMENTS]:
-        if other != candidate and scores[other] > -np.inf:
-            replacements.append(other)
-    return replacements
+    likely = scores.argsort()[::-1][:_REPLACEMENTS]
+    # Those of another part of the map, at -inf, are none.
+    likely = likely[(scores[likely] > -np.inf) & (likely != candidate)]
+    replacements = np.full(likely.shape[0] + 1, -1, dtype=np.int64)
+    replacements[1:] = likely
+    return replacements if likely.shape[0] > 0 else likely
 
 
 @njit(nogil=True, cache=True)
