@@ -79,14 +79,17 @@ class FiniteMDP:
         return (len(self.row_starts) - 1) // self.action_count
 
     def same_action(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """(U, A) the first action with the same outcomes and probabilities."""
+        """(U, A) the first action with the same outcomes and, but for rounding, probabilities."""
         same = np.empty((len(states), self.action_count), dtype=np.int64)
         for index, state in enumerate(states):
             first: dict[bytes, int] = {}
             for action in self.actions:
                 row = slice(*self.row_starts[action * self.state_count + state :][:2])
-                outcome = self.successors[row].tobytes() + self.probabilities[row].tobytes()
-                same[index, action] = first.setdefault(outcome, int(action))
+                outcomes, entry = np.unique(self.successors[row], return_inverse=True)
+                # Sums of the same shares in another order differ in their last bits.
+                shares = np.round(np.bincount(entry, self.probabilities[row]), 12)
+                key = outcomes.tobytes() + shares.tobytes()
+                same[index, action] = first.setdefault(key, int(action))
         return same
 
     def parts_of(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
