@@ -44,6 +44,18 @@ def uniform_probability(model: PursuitModel, state: int) -> npt.NDArray[np.float
     return np.asarray(differs / differs.sum())
 
 
+def likelihood_of(model: PursuitModel, parameters: Parameters, t: int) -> npt.NDArray[np.float64]:
+    """(G,) P(a_t | s_t, g), slips summed over."""
+    state, action, slip = model.state_of[t], model.action_of[t], parameters[2]
+    return np.array(
+        [
+            (1.0 - slip) * explained_probability(model, parameters, state, g)[action]
+            + slip * uniform_probability(model, state)[action]
+            for g in range(len(model.candidate_part))
+        ]
+    )
+
+
 def urn_probability(
     model: PursuitModel, parameters: Parameters, drawn: list[int], subgoal: int
 ) -> float:
@@ -87,6 +99,22 @@ def history_probability(
     return probability
 
 
+def largest_joint(model: PursuitModel, parameters: Parameters) -> float:
+    """Largest log P(subgoals, switches, actions | parameters), slips summed over."""
+    likelihood = np.array(
+        [likelihood_of(model, parameters, t) for t in range(len(model.state_of))]
+    )
+    return float(
+        np.log(
+            max(
+                history_probability(model, parameters, subgoals, switched)
+                * np.prod(likelihood[np.arange(len(subgoals)), list(subgoals)])
+                for subgoals, switched in histories(model)
+            )
+        )
+    )
+
+
 def table_counts(customers: int, concentration: float) -> npt.NDArray[np.float64]:
     """(customers + 1,) distribution of the number of tables of a Chinese restaurant process."""
     distribution = np.zeros(customers + 1)
@@ -122,7 +150,6 @@ class PursuitEnumeration:
         partition_count: (N + 1,) distribution of the number of partitions that explain something.
         switched: (N,) probability of a switch at each observation.
         log_evidence: log P(actions | parameters).
-        best: largest log P(subgoals, switches, actions | parameters), slips summed over.
     """
 
     def __init__(self, model: PursuitModel, parameters: Parameters) -> None:
@@ -148,7 +175,6 @@ class PursuitEnumeration:
         self.co_assignment = np.zeros((count, count))
         self.partition_count = np.zeros(count + 1)
         self.switched = np.zeros(count)
-        self.best = -np.inf
         total = 0.0
         told: dict[tuple[int, ...], tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]] = {}
         of_sizes = np.zeros((count + 1) ** candidates)  # weight by how many draws of each subgoal
@@ -160,7 +186,6 @@ class PursuitEnumeration:
             if weight == 0.0:
                 continue
             total += weight
-            self.best = max(self.best, float(np.log(weight)))
             self.switched += weight * np.array(switched)
             self.pursued[everyone, theta] += weight
             share = likely / (likely + unexplained)  # slips are independent, given the history
