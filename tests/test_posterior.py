@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from threading import Event
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.errors import InputError
+from bnirl_ros.inference import pursuit_mode
 from bnirl_ros.inference.chains import StoppedError, run_chains
 from bnirl_ros.inference.mode import ascend
-from bnirl_ros.inference.posterior import Posterior, grid_world, infer, paper_model
+from bnirl_ros.inference.posterior import Posterior, grid_world, infer, model_of
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.inference.summary import episode_visits, summarise
 from bnirl_ros.maps.grid_map import GridMap
 from bnirl_ros.mdp.actions import STEPS
 from bnirl_ros.mdp.finite_mdp import FiniteMDP
-from bnirl_ros.model.mixture import subgoal_mixture
+from bnirl_ros.model.mixture import SubgoalMixture, subgoal_mixture
+from bnirl_ros.model.pursuits import PRIORS, PursuitModel, pursuit_model
 from reference import set_partitions
 
 MAP = GridMap(np.ones((7, 7), dtype=bool), resolution=0.5, origin=(-1.0, 2.0, 0.0))
 QUICK = Settings(sweeps=300, burn_in=100, chains=3)
+PAPER = replace(QUICK, model="paper", alpha=50.0, eta=1.0)
+MODELS = ("sequential", "paper")
 
 
 def walk(*corners: tuple[int, int], episodes: int = 2) -> Demonstration:
@@ -48,9 +54,9 @@ def walk(*corners: tuple[int, int], episodes: int = 2) -> Demonstration:
 ROUND = walk((0, 0), (6, 0), (6, 6), (0, 6), (0, 0))
 
 
-@pytest.fixture(scope="module")
-def posterior() -> Posterior:
-    return infer(ROUND, MAP, QUICK)
+@pytest.fixture(scope="module", params=MODELS)
+def posterior(request: pytest.FixtureRequest) -> Posterior:
+    return infer(ROUND, MAP, replace(QUICK, model=request.param))
 
 
 def test_finds_the_corners_in_their_order(posterior: Posterior) -> None:
@@ -69,8 +75,9 @@ def test_finds_the_corners_in_their_order(posterior: Posterior) -> None:
         (4,),
     ]
     assert sum(subgoal.observations for subgoal in summary.subgoals) == len(ROUND)
-    counts = [subgoal.observations for subgoal in summary.subgoals]
-    assert counts == sorted(counts, reverse=True)
+    paper = posterior.settings.model == "paper"
+    sizes = [subgoal.observations if paper else subgoal.pursuits for subgoal in summary.subgoals]
+    assert sizes == sorted(sizes, reverse=True)
     for subgoal in summary.subgoals:
         assert subgoal.probability == summary.cell_probability[subgoal.cell[1], subgoal.cell[0]]
         assert subgoal.probability > 0.95
@@ -81,22 +88,35 @@ def test_finds_the_corners_in_their_order(posterior: Posterior) -> None:
 
 
 def test_equal_seeds_give_equal_posteriors_and_others_do_not(posterior: Posterior) -> None:
-    again = infer(ROUND, MAP, QUICK)
-    for name in ("subgoal_of", "partition_of", "log_joint"):
+    again = infer(ROUND, MAP, posterior.settings)
+    for name in ("subgoal_of", "partition_of", "log_joint", "parameters"):
         np.testing.assert_array_equal(getattr(posterior.draws, name), getattr(again.draws, name))
-    other = infer(ROUND, MAP, replace(QUICK, seed=1))
+    other = infer(ROUND, MAP, replace(posterior.settings, seed=1))
     assert (other.draws.log_joint != posterior.draws.log_joint).any()
 
 
 def test_chains_do_not_depend_on_how_many_there_are(posterior: Posterior) -> None:
-    one = infer(ROUND, MAP, replace(QUICK, chains=1))
+    one = infer(ROUND, MAP, replace(posterior.settings, chains=1))
     np.testing.assert_array_equal(one.draws.subgoal_of[0], posterior.draws.subgoal_of[0])
     assert one.rhat is None
 
 
-def test_burn_in_and_thinning_choose_sweeps_of_the_same_chain() -> None:
-    whole = infer(ROUND, MAP, Settings(sweeps=100, burn_in=0, chains=1))
-    part = infer(ROUND, MAP, Settings(sweeps=100, burn_in=30, thin=4, chains=1))
+def test_chains_do_not_depend_on_the_number_of_cores(
+    posterior: Posterior, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)
+    on_one = infer(ROUND, MAP, posterior.settings)
+    for name in ("subgoal_of", "partition_of", "log_joint", "parameters"):
+        np.testing.assert_array_equal(getattr(posterior.draws, name), getattr(on_one.draws, name))
+    np.testing.assert_array_equal(posterior.mode.subgoal_of, on_one.mode.subgoal_of)
+    assert posterior.mode.log_joint == on_one.mode.log_joint
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_burn_in_and_thinning_choose_sweeps_of_the_same_chain(model: str) -> None:
+    settings = Settings(sweeps=100, burn_in=0, chains=1, model=model)
+    whole = infer(ROUND, MAP, settings)
+    part = infer(ROUND, MAP, replace(settings, burn_in=30, thin=4))
     # burn-in sweeps, then the last of every four
     np.testing.assert_array_equal(part.draws.log_joint[0], whole.draws.log_joint[0, 33:100:4])
 
@@ -104,7 +124,9 @@ def test_burn_in_and_thinning_choose_sweeps_of_the_same_chain() -> None:
 def test_probabilities_are_shares_of_the_draws(posterior: Posterior) -> None:
     drawn = posterior.draws.subgoal_of.reshape(-1, len(ROUND))
     shares = posterior.assignment_probability()
-    np.testing.assert_allclose(shares.sum(axis=1), 1.0)
+    slips = (drawn == -1).mean(axis=0)
+    assert slips.any() == (posterior.settings.model == "sequential")
+    np.testing.assert_allclose(shares.sum(axis=1), 1.0 - slips)
     for candidate in range(len(posterior.candidates)):
         assert posterior.subgoal_probability()[candidate] == pytest.approx(
             (drawn == candidate).any(axis=1).mean()
@@ -115,9 +137,9 @@ def test_probabilities_are_shares_of_the_draws(posterior: Posterior) -> None:
 def test_last_poses_are_candidates_and_free_cells_on_request() -> None:
     demonstration = walk((0, 0), (3, 0), episodes=1)
     moved_on = replace(demonstration, last_cells=np.array([[4, 1]]))
-    candidates, _ = paper_model(moved_on, MAP, Settings())
+    candidates, _ = model_of(moved_on, MAP, Settings())
     assert candidates.tolist() == [[0, 0], [1, 0], [2, 0], [3, 0], [4, 1]]
-    candidates, _ = paper_model(moved_on, MAP, Settings(candidates="free"))
+    candidates, _ = model_of(moved_on, MAP, Settings(candidates="free"))
     assert len(candidates) == 49
 
 
@@ -132,8 +154,11 @@ def test_the_mode_is_the_largest_of_every_partition_and_subgoal() -> None:
             np.empty(0, dtype=np.int64),
             np.empty((0, 2), dtype=np.int64),
         )
-        settings = Settings(alpha=0.5 + seed / 4, eta=0.2 + seed, sweeps=300, chains=4)
-        _, mixture = paper_model(demonstration, MAP, settings)
+        settings = Settings(
+            model="paper", alpha=0.5 + seed / 4, eta=0.2 + seed, sweeps=300, chains=4
+        )
+        _, mixture = model_of(demonstration, MAP, settings)
+        assert isinstance(mixture, SubgoalMixture)
         posterior = infer(demonstration, MAP, settings)
         by_observation = mixture.log_likelihood[mixture.pair_of]
         best = -np.inf
@@ -146,10 +171,11 @@ def test_the_mode_is_the_largest_of_every_partition_and_subgoal() -> None:
         assert posterior.mode.log_joint == pytest.approx(best, abs=1e-9)
 
 
-def test_ascent_never_loses_and_tells_its_log_joint(posterior: Posterior) -> None:
-    _, mixture = paper_model(ROUND, MAP, QUICK)
+def test_ascent_never_loses_and_tells_its_log_joint() -> None:
+    _, mixture = model_of(ROUND, MAP, PAPER)
+    assert isinstance(mixture, SubgoalMixture)
+    chain = infer(ROUND, MAP, PAPER).draws[0]
     for draw in range(0, 200, 20):
-        chain = posterior.draws[0]
         mode = ascend(mixture, chain.partition_of[draw], chain.subgoal_of[draw])
         assert mode.log_joint >= chain.log_joint[draw] - 1e-9
         _, first = np.unique(mode.partition_of, return_index=True)
@@ -159,26 +185,77 @@ def test_ascent_never_loses_and_tells_its_log_joint(posterior: Posterior) -> Non
         )
 
 
-def test_the_sampler_takes_any_finite_mdp() -> None:
+def test_ascent_of_pursuits_never_loses_and_leaves_slips_out() -> None:
+    # A stray step in the middle of a leg: a slip, which no partition has.
+    strayed = replace(ROUND, action=np.where(np.arange(len(ROUND)) == 3, 6, ROUND.action))
+    _, model = model_of(strayed, MAP, QUICK)
+    assert isinstance(model, PursuitModel)
+    posterior = infer(strayed, MAP, QUICK)
+    parameters = np.median(posterior.draws.parameters.reshape(-1, len(PRIORS)), axis=0)
+    assert posterior.mode.subgoal_of[3] == posterior.mode.partition_of[3] == -1
+    for draw in range(0, 200, 20):
+        drawn = posterior.draws.subgoal_of[0, draw]
+        mode = pursuit_mode.ascend(model, drawn, parameters)
+        assert mode.log_joint >= log_joint_told(model, drawn, parameters) - 1e-9
+        assert mode.log_joint == pytest.approx(
+            log_joint_told(model, mode.subgoal_of, parameters), abs=1e-8
+        )
+        explained = mode.partition_of >= 0
+        np.testing.assert_array_equal(explained, mode.subgoal_of >= 0)
+        _, first = np.unique(mode.partition_of[explained], return_index=True)
+        assert (np.diff(first) > 0).all()
+        # One partition for each subgoal.
+        assert len(first) == len(np.unique(mode.subgoal_of[explained]))
+
+
+def log_joint_told(
+    model: PursuitModel, subgoal_of: npt.NDArray[np.int32], parameters: npt.NDArray[np.float64]
+) -> float:
+    """Log joint of subgoals that persist through slips (-1), with a switch at each change."""
+    persisting = subgoal_of.copy()
+    count = len(persisting)
+    for t in range(1, count):
+        if persisting[t] < 0 and not model.starts[t]:
+            persisting[t] = persisting[t - 1]
+    for t in range(count - 2, -1, -1):  # at the beginning of an episode, the one after
+        if persisting[t] < 0:
+            persisting[t] = persisting[t + 1]
+    switched = model.starts | (np.diff(persisting, prepend=persisting[:1]) != 0)
+    return model.log_joint(persisting, switched, parameters)
+
+
+def test_the_samplers_take_any_finite_mdp() -> None:
     world = grid_world(MAP, QUICK)
     mdp = FiniteMDP.from_transitions(world.transitions(), world.discount)
-    candidates, on_grid = paper_model(ROUND, MAP, QUICK)
+    candidates, on_grid = model_of(ROUND, MAP, PAPER)
+    assert isinstance(on_grid, SubgoalMixture)
     states, goals = world.states_of(ROUND.cells), world.states_of(candidates)
-    mixture = subgoal_mixture(mdp, states, ROUND.action, goals, QUICK.alpha, QUICK.eta)
+    mixture = subgoal_mixture(mdp, states, ROUND.action, goals, alpha=50.0, eta=1.0)
     np.testing.assert_allclose(mixture.log_likelihood, on_grid.log_likelihood, atol=1e-5)
     np.testing.assert_array_equal(mixture.pair_of, on_grid.pair_of)
-    draws = run_chains(mixture, QUICK)
-    np.testing.assert_array_equal(draws.subgoal_of, run_chains(on_grid, QUICK).subgoal_of)
+    draws = run_chains(mixture, PAPER)
+    np.testing.assert_array_equal(draws.subgoal_of, run_chains(on_grid, PAPER).subgoal_of)
+
+    _, in_sequence = model_of(ROUND, MAP, QUICK)
+    assert isinstance(in_sequence, PursuitModel)
+    model = pursuit_model(mdp, states, ROUND.action, ROUND.starts, goals)
+    np.testing.assert_allclose(model.cost, in_sequence.cost, atol=1e-6)
+    np.testing.assert_array_equal(model.action_of, in_sequence.action_of)
+    np.testing.assert_array_equal(model.arrived, in_sequence.arrived)
+    draws, on_map = run_chains(model, QUICK), run_chains(in_sequence, QUICK)
+    np.testing.assert_array_equal(draws.subgoal_of, on_map.subgoal_of)
 
 
-def test_progress_counts_every_sweep_and_stopping_stops() -> None:
+@pytest.mark.parametrize("model", MODELS)
+def test_progress_counts_every_sweep_and_stopping_stops(model: str) -> None:
+    settings = replace(QUICK, model=model)
     done: list[int] = []
-    infer(ROUND, MAP, QUICK, progress=done.append)
-    assert sum(done) == QUICK.sweeps * QUICK.chains
+    infer(ROUND, MAP, settings, progress=done.append)
+    assert sum(done) == settings.sweeps * settings.chains
     stop = Event()
     stop.set()
     with pytest.raises(StoppedError):
-        infer(ROUND, MAP, QUICK, stop=stop)
+        infer(ROUND, MAP, settings, stop=stop)
 
 
 def test_nothing_observed_is_nothing_to_infer() -> None:
@@ -200,7 +277,7 @@ def test_nothing_observed_is_nothing_to_infer() -> None:
         ({"candidates": "some"}, "candidates must be one of visited, free"),
         ({"sweeps": 100, "burn_in": 100}, "sweeps must leave a draw"),
         ({"thin": 0}, "thin must be at least 1"),
-        ({"model": "best"}, "model must be one of paper"),
+        ({"model": "best"}, "model must be one of sequential, paper, not best"),
         ({"seed": -1}, "seed must be at least 0"),
         ({"alpha": "5"}, "alpha must be of type float, not '5'"),
         ({"sweeps": 1000.5}, "sweeps must be of type int, not 1000.5"),
