@@ -85,12 +85,6 @@ def _parser() -> argparse.ArgumentParser:
     demo = commands.add_parser("demo", help="watch a human demonstration become subgoals")
     demo.add_argument("--bag", type=Path, help="another bag than the human demonstration")
     demo.add_argument(
-        "--alpha",
-        type=above_zero,
-        default=5.0,
-        help="confidence; lower than that of infer, since people dither (%(default)s)",
-    )
-    demo.add_argument(
         "--out", type=Path, default=Path("bnirl_out"), help="folder for the results (%(default)s)"
     )
     demo.set_defaults(run=_demo)
@@ -184,7 +178,7 @@ def _demo(options: argparse.Namespace) -> int:
     from bnirl_ros.nodes.demo import main as demo
 
     gc.enable()  # this may run for long
-    return demo(options.bag, options.out, options.alpha)
+    return demo(options.bag, options.out)
 
 
 def _read(

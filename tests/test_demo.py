@@ -23,7 +23,7 @@ LOOP = share_folder() / "bags" / "paper_loop"
 @pytest.mark.timeout(300)
 def test_demo_tells_shows_and_records_what_it_found(tmp_path: Path) -> None:
     out = tmp_path / "demo"
-    command = [sys.executable, "-m", "bnirl_ros.cli", "demo", "--bag", LOOP, "--alpha", "50"]
+    command = [sys.executable, "-m", "bnirl_ros.cli", "demo", "--bag", LOOP]
     environment = {**os.environ, "PYTHONPATH": str(share_folder())}
     environment.pop("ROS_DOMAIN_ID", None)  # one of its own
     done = subprocess.run(

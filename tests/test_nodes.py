@@ -27,7 +27,7 @@ from bnirl_ros.demonstrations.messages import stamp_of
 from bnirl_ros.demonstrations.placement import place
 from bnirl_ros.experiments.demonstration_bag import first_episodes, write_demonstration
 from bnirl_ros.experiments.scenarios import PAPER_LOOP
-from bnirl_ros.inference.settings import Settings, limits_of
+from bnirl_ros.inference.settings import Settings
 from bnirl_ros.maps import GridMap
 from bnirl_ros.views.messages import MESSAGE_TYPES
 from demonstration_support import (
@@ -52,6 +52,7 @@ from demonstration_support import (
 from ros_support import LATCHED, RELIABLE, NodeProcess, Peer, isolate
 
 from bnirl_ros.nodes.conversion import message_class, to_ros  # isort: skip  # needs rclpy
+from bnirl_ros.nodes.parameters import INFERRED, parameter_of  # isort: skip
 from bnirl_ros.nodes.subgoal_node import OUTPUTS, PARAMETERS  # isort: skip
 
 diagnostic_msgs = importlib.import_module("diagnostic_msgs.msg")
@@ -514,7 +515,7 @@ def test_callbacks_are_served_while_inference_runs(
     served = 0
     while not all(answer.done() for answer in answers):
         (value,) = peer.call(kind, "/subgoal_node/get_parameters", request).values
-        assert value.double_value == 50.0
+        assert value.double_value == INFERRED
         served += 1
     assert all(answer.result().success for answer in answers)
     assert served > 5
@@ -525,10 +526,9 @@ def test_callbacks_are_served_while_inference_runs(
 
 def test_parameters_are_described(subgoals: Callable[..., Subgoals]) -> None:
     node = subgoals()
-    expected = {setting.name: limits_of(setting) for setting in fields(Settings)}
-    expected |= {entry.name: entry.limits for entry in PARAMETERS}
-    defaults = {setting.name: setting.default for setting in fields(Settings)}
-    defaults |= {entry.name: entry.default for entry in PARAMETERS}
+    table = [*map(parameter_of, fields(Settings)), *PARAMETERS]
+    expected = {entry.name: entry.limits for entry in table}
+    defaults = {entry.name: entry.default for entry in table}
     names = list(expected)
 
     kind = parameter_services.DescribeParameters
@@ -560,11 +560,12 @@ def test_parameters_can_be_set_and_bad_values_are_refused_with_a_reason(
     node = subgoals(**QUICK, result_folder=tmp_path)
     node.send([map_of_grid()], walk())
     refused: dict[str, tuple[Any, str]] = {
-        "alpha": (-1.0, "alpha"),
+        "alpha": (-2.0, "alpha"),
+        "slip": (-0.5, "slip must be at least 0 and below 1, not -0.5"),
         "eta": (0.0, "eta must be above 0, not 0"),
         "moves": (5, "moves must be one of 4, 8, not 5"),
         "sweeps": (100, "sweeps must leave a draw: 100 sweeps less 100 of burn-in"),
-        "model": ("none", "model must be one of paper"),
+        "model": ("none", "model must be one of sequential, paper"),
         "discount": (math.nan, "discount"),
         "seed": ("text", "expected 'Type.INTEGER' got 'Type.STRING'"),
         "queue_depth": (1, "read-only"),
@@ -578,7 +579,7 @@ def test_parameters_can_be_set_and_bad_values_are_refused_with_a_reason(
         assert reason in result.reason
     assert node.call("infer").success
     document = json.loads((tmp_path / "subgoals.json").read_text())
-    assert document["model"]["alpha"] == 50.0  # nothing has changed
+    assert document["parameters"]["alpha"]["inferred"]  # nothing has changed
 
     accepted = node.set(alpha=20.0, chains=2, burn_in=50)
     assert all(result.successful for result in accepted), accepted
@@ -593,9 +594,9 @@ def test_parameters_can_be_set_and_bad_values_are_refused_with_a_reason(
 @pytest.mark.parametrize(
     ("parameters", "sentence"),
     [
-        ({"alpha": -1.0}, "parameter alpha: must be above 0"),
-        ({"alpha": 0.0}, "parameter alpha must be above 0, not 0.0"),
-        ({"alpha": "text"}, "parameter alpha: must be of type float, such as 50.0"),
+        ({"alpha": -2.0}, "parameter alpha: must be at least -1"),
+        ({"alpha": 0.0}, "alpha must be above 0, not 0.0"),
+        ({"alpha": "text"}, "parameter alpha: must be of type float, such as -1.0"),
         ({"moves": 5}, "parameter moves must be one of 4, 8, not 5"),
         ({"sweeps": 10, "burn_in": 10}, "sweeps must leave a draw: 10 sweeps less 10 of burn-in"),
         ({"queue_depth": 0}, "parameter queue_depth: must be at least 1 and at most 1e+07"),

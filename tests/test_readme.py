@@ -206,15 +206,20 @@ def test_services_are_the_codes() -> None:
 
 
 def test_parameter_file_has_every_parameter_with_its_default() -> None:
+    pytest.importorskip("rclpy")
+    from bnirl_ros.nodes.parameters import INFERRED
+
     text = (ROOT / "config" / "subgoal_node.yaml").read_text(encoding="utf-8")
     given = yaml.safe_load(text)["/**"]["ros__parameters"]
-    settings = {setting.name: setting.default for setting in fields(Settings)}
+    settings = {
+        setting.name: INFERRED if setting.default is None else setting.default
+        for setting in fields(Settings)
+    }
     assert {name: given.get(name) for name in settings} == settings
     # ROS takes no integer for a parameter of floating point.
     assert {name: type(given[name]) for name in settings} == {
         name: type(default) for name, default in settings.items()
     }
-    pytest.importorskip("rclpy")
     from bnirl_ros.nodes.subgoal_node import PARAMETERS
 
     own = {parameter.name: parameter.default for parameter in PARAMETERS}

@@ -95,7 +95,7 @@ class _Watcher(Node):
         )
 
 
-def demo(bag: Path, out: Path, alpha: float) -> None:
+def demo(bag: Path, out: Path) -> None:
     """Replay a bag to the node, both in processes of their own, and print what comes of it.
 
     Leaves in `out` the three result files of an inference, and a bag of what was published.
@@ -108,8 +108,8 @@ def demo(bag: Path, out: Path, alpha: float) -> None:
         watcher = _Watcher(writer)
         stack.callback(watcher.destroy_node)
         tell = stack.enter_context(_teller())
-        parameters = ["-p", f"result_folder:={out.resolve()}", "-p", f"alpha:={alpha}"]
-        node = stack.enter_context(_process("subgoal_node", ["--ros-args", *parameters]))
+        parameters = ["--ros-args", "-p", f"result_folder:={out.resolve()}"]
+        node = stack.enter_context(_process("subgoal_node", parameters))
         replay = stack.enter_context(_process("replay_node", [str(bag), "--fast"]))
 
         def replayed() -> bool:
@@ -200,7 +200,7 @@ def _teller() -> Iterator[Callable[[str], None]]:
     yield tell
 
 
-def main(bag: Path | None, out: Path, alpha: float) -> int:
+def main(bag: Path | None, out: Path) -> int:
     """Run the demo with the human bag or another one; returns the exit status."""
     # Robots and other demos need not hear of it; who wants to listen names the same domain.
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -211,7 +211,7 @@ def main(bag: Path | None, out: Path, alpha: float) -> int:
 
     def body() -> None:
         nonlocal finished
-        demo(played, out, alpha)
+        demo(played, out)
         finished = True
 
     status = run("bnirl demo", body, [])

@@ -44,6 +44,16 @@ class NodeParameter:
     read_only: bool = True
 
 
+def parameter_of(setting: Field[Any]) -> NodeParameter:
+    """A parameter for a setting; one of the model that may be inferred has a value for that."""
+    limits = limits_of(setting)
+    if setting.default is not None:
+        return NodeParameter(setting.name, setting.default, limits, read_only=False)
+    described = f"{limits.description}; {INFERRED:g}: not given"
+    limits = replace(limits, description=described, lowest=INFERRED, above=-math.inf)
+    return NodeParameter(setting.name, INFERRED, limits, read_only=False)
+
+
 def declare(node: Node, table: Sequence[NodeParameter]) -> dict[str, Any]:
     """Declare parameters with type, range and description; returns their values by name.
 
@@ -65,7 +75,7 @@ def declare_settings(node: Node, on_change: Callable[[Settings], None]) -> Setti
     Raises:
         InputError: as in `declare`.
     """
-    table = [_of_setting(setting) for setting in fields(Settings)]
+    table = [parameter_of(setting) for setting in fields(Settings)]
     names = {entry.name for entry in table}
     inferable = {setting.name for setting in fields(Settings) if setting.default is None}
 
@@ -97,16 +107,6 @@ def declare_settings(node: Node, on_change: Callable[[Settings], None]) -> Setti
     node.add_on_set_parameters_callback(check)
     node.add_post_set_parameters_callback(apply)
     return settings
-
-
-def _of_setting(setting: Field[Any]) -> NodeParameter:
-    """A parameter for a setting; one of the model that may be inferred has a value for that."""
-    limits = limits_of(setting)
-    if setting.default is not None:
-        return NodeParameter(setting.name, setting.default, limits, read_only=False)
-    described = f"{limits.description}; {INFERRED:g}: not given"
-    limits = replace(limits, description=described, lowest=INFERRED, above=-math.inf)
-    return NodeParameter(setting.name, INFERRED, limits, read_only=False)
 
 
 def _declared(node: Node, entry: NodeParameter) -> Any:
