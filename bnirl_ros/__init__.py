@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from bnirl_ros.demonstrations.demonstration import Demonstration
     from bnirl_ros.demonstrations.placement import place
     from bnirl_ros.errors import InputError
+    from bnirl_ros.inference.filtering import SubgoalFilter
     from bnirl_ros.inference.posterior import infer
     from bnirl_ros.inference.settings import Settings
     from bnirl_ros.inference.summary import summarise
@@ -25,6 +26,7 @@ __all__ = [
     "GridMap",
     "InputError",
     "Settings",
+    "SubgoalFilter",
     "infer",
     "load_map",
     "place",
@@ -38,6 +40,7 @@ _MODULE_OF = {
     "GridMap": "maps",
     "InputError": "errors",
     "Settings": "inference.settings",
+    "SubgoalFilter": "inference.filtering",
     "infer": "inference.posterior",
     "load_map": "maps",
     "place": "demonstrations.placement",
