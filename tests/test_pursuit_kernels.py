@@ -128,7 +128,8 @@ def test_the_filter_is_the_one_over_all_pairs_of_subgoals(seed: int) -> None:
 
 def test_ascent_finds_the_largest_of_every_history() -> None:
     # From any subgoals at all, which is harder than from the best draws of chains. It is
-    # coordinate ascent, which may end lower: here in 1 of 150 cases, by half a nat.
+    # coordinate ascent, which may end lower: here in 1 of 150 cases, by half a nat; in 24 of 1,500
+    # others, by 1.2 nats at most.
     found, cases = 0, 150
     for seed in range(cases):
         generator = np.random.default_rng(1000 + seed)
