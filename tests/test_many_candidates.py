@@ -2,15 +2,17 @@
 
 Found means that every true subgoal has more than twice as many pursuits as any other candidate. It
 counts from the first sweep from which that holds in nine of ten sweeps up to the eightieth.
-Measured for the seeds here, from the sampler's own start: 7, 4, 3, 6, 10 and 12 sweeps; with all
-in one random subgoal: 18, 3, 8, 11, 6, and for seed 5 not within 60. Of 24 more demonstrations
-each took at most 16 and 24 sweeps.
+Measured with the seeds here, 0 to 6: from the sampler's own start 7, 4, 3, 6, 10, 12 and 6 sweeps;
+from all in one random subgoal 18, 3, 8, 11, 6, none within 60, and 4. Of 23 more demonstrations
+with one seed each, all took at most 16 and 24.
 
-What happens to seed 5 is no matter of luck with one seed alone: of 30 other seeds on the same
-demonstration 6 fail from that start. All pursuits of one subgoal agree on a cell beside the true
-one, a local optimum some 5 nats below the truth. To leave it, pursuits would have to go one by
-one, the first to a subgoal that the urn has never given (8 nats), or all at once with their
-switches where they are, most of which are no arrivals at the true one.
+Demonstration 5 is another matter, whatever the start: with 30 other seeds of the sampler 10 fail
+from its own start and 6 from the worst. There, all pursuits of one subgoal agree on a cell beside
+the true one, a local optimum some 5 nats below the truth (by the mode's ascent from either). To
+leave it, pursuits would have to go one by one, the first to a subgoal that the urn has never
+given, or all at once with their switches where they are, most of which are no arrivals at the true
+one.
+So it is marked as one that may fail: a known weakness, and work to do.
 """
 
 from __future__ import annotations
@@ -98,16 +100,14 @@ def sweeps_needed(
     return SWEEPS + 1
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_the_truth_is_found_within_sixty_sweeps(world_model: PursuitModel, seed: int) -> None:
+BESIDE = pytest.mark.xfail(strict=False, reason="may stay in a cell beside a true subgoal")
+SEEDS = [0, 1, 2, 3, 4, pytest.param(5, marks=BESIDE), 6]
+
+
+@pytest.mark.parametrize("worst_start", [False, True], ids=["own start", "worst start"])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_truth_is_found_within_sixty_sweeps(
+    world_model: PursuitModel, seed: int, worst_start: bool
+) -> None:
     model, goals = demonstrated(world_model, np.random.default_rng(seed))
-    assert sweeps_needed(model, goals, seed, worst_start=False) <= SWEEPS
-
-
-BESIDE = pytest.mark.xfail(strict=False, reason="stays in a cell beside a true subgoal")
-
-
-@pytest.mark.parametrize("seed", [0, 1, 2, 3, 4, pytest.param(5, marks=BESIDE)])
-def test_the_truth_is_found_from_the_worst_start(world_model: PursuitModel, seed: int) -> None:
-    model, goals = demonstrated(world_model, np.random.default_rng(seed))
-    assert sweeps_needed(model, goals, seed, worst_start=True) <= SWEEPS
+    assert sweeps_needed(model, goals, seed, worst_start) <= SWEEPS
