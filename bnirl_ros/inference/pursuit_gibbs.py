@@ -8,11 +8,12 @@ A sweep draws, each given all else:
    integrated out: held as a variable they would keep a candidate that is in no pursuit from ever
    being tried. A switch depends on the old subgoal through rho alone, so that an observation costs
    O(G), not O(G^2). Blocks differ in length from sweep to sweep;
-2. the switch probabilities, together with the switches to the same subgoal again, and eta, all
+2. the place of one subgoal, with all paths open;
+3. the switch probabilities, together with the switches to the same subgoal again, and eta, all
    parameters by slice sampling;
-3. partitions, given the subgoals, by the Chinese restaurant process that the urn collapses, and
+4. partitions, given the subgoals, by the Chinese restaurant process that the urn collapses, and
    the subgoal of each partition anew: whole groups of pursuits move at once;
-4. alpha and the probability of a slip, while it is open which actions are slips.
+5. alpha and the probability of a slip, while it is open which actions are slips.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ _SHORTEST_BLOCK, _LONGEST_BLOCK = 8, 1024  # observations; their logarithm is un
 _BLOCK_ENTRIES = 4_000_000  # of the forward messages: shorter blocks where candidates are many
 _SLICE = 0.7  # first width of a slice, of a logarithm
 _CONFIDENCE_PERIOD = 4  # sweeps between two draws of alpha, where those cost more than the rest
+_RELOCATED = 2000  # observations, beyond which a subgoal is relocated less than once in a sweep
+_HEAVY = 1e-6  # a weight above which a candidate's place matters to a relocation
 _FARTHEST = 27.0  # logarithms and logits are not sought beyond
 _RAREST = 1e-12  # probabilities stay off 0 and 1, which would rule out what is only improbable
 
@@ -65,7 +68,8 @@ class KernelModel(NamedTuple):
     """A `PursuitModel` as the kernels take it.
 
     Attributes:
-        cost, state_of, starts, arrived, state_part, candidate_part, prior, uniform: as there.
+        cost, state_of, starts, arrived, state_part, candidate_part, place, prior, uniform: as
+            there.
         pair_of: (N,) number k of each observation's distinct (state, action) pair.
         pair_state, pair_action: (K,) the pairs.
         near_first: (U + 1,) `near[near_first[u] : near_first[u + 1]]` are the candidates at which
@@ -82,6 +86,7 @@ class KernelModel(NamedTuple):
     arrived: npt.NDArray[np.bool_]
     state_part: npt.NDArray[np.int64]
     candidate_part: npt.NDArray[np.int64]
+    place: npt.NDArray[np.int64]
     prior: npt.NDArray[np.float64]
     uniform: npt.NDArray[np.float64]
     pair_of: npt.NDArray[np.int64]
@@ -105,6 +110,7 @@ def kernel_model(model: PursuitModel) -> KernelModel:
         arrived=model.arrived,
         state_part=model.state_part,
         candidate_part=model.candidate_part,
+        place=model.place,
         prior=model.prior,
         uniform=model.uniform,
         pair_of=pair_of.astype(np.int64),
@@ -240,9 +246,12 @@ def _advance(model, state, generator, thin, subgoal_of, partition_of, log_joint,
     # A draw of alpha takes a new table, an exponential for each of its states and actions.
     states, actions = model.cost.shape[:2]
     period = 1 if states * actions <= label.shape[0] else _CONFIDENCE_PERIOD
+    relocation_period = 1 + label.shape[0] // _RELOCATED
     for draw in range(log_joint.shape[0]):
         for _ in range(thin):
             _draw_blocks(model, state, chosen, forward, generator)
+            if state.sweeps[0] % relocation_period == 0:
+                _relocate(model, state, chosen, generator)
             # Partitions depend on eta and on the switches, whose draws have them integrated out:
             # they come after these.
             _draw_switches(model, state, generator)
@@ -412,7 +421,6 @@ def _draw_blocks(model, state, chosen, forward, generator):  # type: ignore[no-u
 def _draw_block(model, state, chosen, forward, first, end, generator):  # type: ignore[no-untyped-def]
     """Observations `first` to `end` of one episode, and whether there is a switch at `end`."""
     theta, parameters, counts = state.subgoal_of, state.parameters, state.counts
-    candidates = counts.shape[0]
     goes_on = end < model.starts.shape[0] and not model.starts[end]
     last = end + 1 if goes_on else end
     for t in range(first, last):
@@ -421,13 +429,37 @@ def _draw_block(model, state, chosen, forward, first, end, generator):  # type: 
     part = model.state_part[model.state_of[first]]
     weights = urn_weights(model, parameters[ETA], counts, part)
 
+    new_theta, new_switched = _draw_path(
+        model, parameters, chosen, weights, theta, forward, first, end, generator
+    )
+    ratio = urn_ratio(model, parameters[ETA], counts, weights, new_theta, new_switched)
+    ratio -= urn_ratio(
+        model, parameters[ETA], counts, weights, theta[first:last], state.switched[first:last]
+    )
+    if ratio >= 0.0 or generator.random() < math.exp(ratio):
+        theta[first:last] = new_theta
+        state.switched[first:last] = new_switched
+    for t in range(first, last):
+        if state.switched[t]:
+            counts[theta[t]] += 1
+
+
+@njit(nogil=True, cache=True)
+def _draw_path(model, parameters, chosen, weights, theta, forward, first, end, generator):  # type: ignore[no-untyped-def]
+    """Subgoals of observations `first` to `end` of one episode, and where they were switched to.
+
+    By forward filtering, backward sampling: given the `weights`, the parameters, and the subgoals
+    before `first` and, where the episode goes on, at `end`; the switch at `end` is drawn, too.
+    """
+    candidates = weights.shape[0]
+    goes_on = end < model.starts.shape[0] and not model.starts[end]
+    last = end + 1 if goes_on else end
     before = np.zeros(candidates)
     if not model.starts[first]:
         before[theta[first - 1]] = 1.0
     evidence = np.empty(end - first)
     forward_pass(model, parameters, chosen, weights, first, end, before, forward, evidence)
 
-    # Backwards: the subgoal of each observation and whether it was switched to.
     new_theta = np.empty(last - first, dtype=np.int32)
     new_switched = np.empty(last - first, dtype=np.bool_)
     weight = np.empty(candidates)
@@ -461,17 +493,7 @@ def _draw_block(model, state, chosen, forward, first, end, generator):  # type: 
         rho = switch_probability(model, parameters, first, new_theta[0])
         switches = rho * weights[new_theta[0]]
         new_switched[0] = generator.random() * (1.0 - rho + switches) >= 1.0 - rho
-
-    ratio = urn_ratio(model, parameters[ETA], counts, weights, new_theta, new_switched)
-    ratio -= urn_ratio(
-        model, parameters[ETA], counts, weights, theta[first:last], state.switched[first:last]
-    )
-    if ratio >= 0.0 or generator.random() < math.exp(ratio):
-        theta[first:last] = new_theta
-        state.switched[first:last] = new_switched
-    for t in range(first, last):
-        if state.switched[t]:
-            counts[theta[t]] += 1
+    return new_theta, new_switched
 
 
 @njit(nogil=True, cache=True)
@@ -500,6 +522,148 @@ def urn_ratio(model, eta, counts, weights, theta, switched):  # type: ignore[no-
         if switched[i]:
             counts[theta[i]] -= 1
     return ratio
+
+
+@njit(nogil=True, cache=True)
+def _relocate(model, state, chosen, generator):  # type: ignore[no-untyped-def]
+    """One subgoal to a cell beside it, or not, all paths and switches being open meanwhile.
+
+    Where all pursuits of a subgoal agree on a cell beside the true one, they would have to leave
+    it one by one, or together with their switches where they are, most of which are arrivals: a
+    chain would stay there for long.
+
+    The weights are drawn and held. Those in a window of 3 x 3 cells, but for other subgoals, are
+    permuted so that the subgoal's comes to lie at any of its cells. The prior of the weights is
+    the same for all permutations, P(g) being uniform, so each has the probability of all actions
+    given the weights, which forward filtering gives. Only paths over the candidates of weight and
+    the window are open, a set that is the same for all permutations and has the present path in
+    it.
+    """
+    weights = _draw_weights(model, state, generator)
+    heavy = 0
+    for candidate in range(weights.shape[0]):
+        heavy += weights[candidate] > _HEAVY
+        if state.counts[candidate] > 0 and weights[candidate] <= _HEAVY:
+            return
+    remaining = int(generator.random() * heavy)
+    subgoal = -1
+    for candidate in range(weights.shape[0]):
+        if weights[candidate] > _HEAVY:
+            if remaining == 0:
+                subgoal = candidate
+                break
+            remaining -= 1
+    left = model.place[subgoal, 0] - int(3.0 * generator.random())
+    bottom = model.place[subgoal, 1] - int(3.0 * generator.random())
+    part = model.candidate_part[subgoal]
+    lanes, window = [], []
+    for candidate in range(weights.shape[0]):
+        if model.candidate_part[candidate] != part:
+            continue
+        light = weights[candidate] <= _HEAVY
+        x, y = model.place[candidate]
+        inside = left <= x < left + 3 and bottom <= y < bottom + 3
+        if candidate == subgoal or (light and inside):
+            window.append(len(lanes))
+        if not light or inside:
+            lanes.append(candidate)
+    candidates = np.array(lanes)
+    longest = 0
+    bounds = _episode_bounds(model, part)
+    for first, end in bounds:
+        longest = max(longest, end - first)
+    if len(window) < 2 or longest * candidates.shape[0] > _BLOCK_ENTRIES:
+        return
+    small = _restricted(model, candidates)
+    likely = np.ascontiguousarray(chosen[:, candidates])
+    forward = np.empty((longest, candidates.shape[0]))
+    evidence = np.empty(longest)
+    light_weights = [weights[candidates[lane]] for lane in window if candidates[lane] != subgoal]
+    scores = np.zeros(len(window))
+    trials = np.empty((len(window), candidates.shape[0]))
+    for option in range(len(window)):
+        trial = weights[candidates]
+        place = 0
+        for other in range(len(window)):
+            if other == option:
+                trial[window[other]] = weights[subgoal]
+            else:
+                trial[window[other]] = light_weights[place]
+                place += 1
+        trials[option] = trial
+        for first, end in bounds:
+            forward_pass(
+                small, state.parameters, likely, trial, first, end, trial, forward, evidence
+            )
+            scores[option] += np.log(evidence[: end - first]).sum()
+    odds = np.exp(scores - scores.max())
+    option = categorical(odds, odds.sum(), generator)
+    for first, end in bounds:
+        path, switched = _draw_path(
+            small,
+            state.parameters,
+            likely,
+            trials[option],
+            state.subgoal_of,
+            forward,
+            first,
+            end,
+            generator,
+        )
+        for t in range(first, end):
+            if state.switched[t]:
+                state.counts[state.subgoal_of[t]] -= 1
+            state.subgoal_of[t] = candidates[path[t - first]]
+            state.switched[t] = switched[t - first]
+            if state.switched[t]:
+                state.counts[state.subgoal_of[t]] += 1
+
+
+@njit(nogil=True, cache=True)
+def _episode_bounds(model, part):  # type: ignore[no-untyped-def]
+    """First observation and end of each episode in a part of the map."""
+    bounds = []
+    first = 0
+    for t in range(1, model.starts.shape[0] + 1):
+        if t == model.starts.shape[0] or model.starts[t]:
+            if model.state_part[model.state_of[first]] == part:
+                bounds.append((first, t))
+            first = t
+    return bounds
+
+
+@njit(nogil=True, cache=True)
+def _restricted(model, candidates):  # type: ignore[no-untyped-def]
+    """A model that knows some of the candidates only, as far as paths are concerned."""
+    arrived = np.ascontiguousarray(model.arrived[:, candidates])
+    first = np.zeros(arrived.shape[0] + 1, dtype=np.int64)
+    near_candidates = np.empty(arrived.sum(), dtype=np.int64)
+    count = 0
+    for state in range(arrived.shape[0]):
+        for lane in range(arrived.shape[1]):
+            if arrived[state, lane]:
+                near_candidates[count] = lane
+                count += 1
+        first[state + 1] = count
+    return KernelModel(
+        model.cost,
+        model.state_of,
+        model.starts,
+        arrived,
+        model.state_part,
+        model.candidate_part[candidates],
+        model.place[candidates],
+        model.prior[candidates],
+        model.uniform,
+        model.pair_of,
+        model.pair_state,
+        model.pair_action,
+        first,
+        near_candidates,
+        model.is_fixed,
+        model.hyper,
+        model.parts,
+    )
 
 
 @njit(nogil=True, cache=True)
@@ -663,24 +827,15 @@ def _draw_switches(model, state, generator):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True)
 def _draw_weights(model, state, generator):  # type: ignore[no-untyped-def]
-    """(G,) weight of each candidate that is pursued, given all draws; 0 for the others."""
+    """(G,) weight of each candidate, given all draws."""
     total = np.zeros(model.parts)
-    left = np.zeros(model.parts)
-    weights = np.zeros(state.counts.shape[0])
+    weights = np.empty(state.counts.shape[0])
     for candidate in range(weights.shape[0]):
-        part, weight = model.candidate_part[candidate], state.parameters[ETA]
-        weight *= model.prior[candidate]
-        if state.counts[candidate] > 0:
-            weights[candidate] = generator.standard_gamma(weight + state.counts[candidate])
-            total[part] += weights[candidate]
-        else:
-            left[part] += weight
-    for part in range(model.parts):
-        if left[part] > 0.0:
-            total[part] += generator.standard_gamma(left[part])
+        weight = state.parameters[ETA] * model.prior[candidate] + state.counts[candidate]
+        weights[candidate] = generator.standard_gamma(weight)
+        total[model.candidate_part[candidate]] += weights[candidate]
     for candidate in range(weights.shape[0]):
-        if weights[candidate] > 0.0:
-            weights[candidate] /= total[model.candidate_part[candidate]]
+        weights[candidate] /= total[model.candidate_part[candidate]]
     return weights
 
 

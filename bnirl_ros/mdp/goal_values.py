@@ -18,8 +18,8 @@ _GOALS_AT_ONCE = 16  # lanes: enough to fill the vector units, few enough to sta
 class MarkovDecisionProcess(Protocol):
     """What the method needs of an MDP without reward.
 
-    That is a discount, the values of goals, which actions do the same, and which states lie in
-    parts between which there is no way.
+    That is a discount, the values of goals, which actions do the same, which states lie in parts
+    between which there is no way, and which lie near each other.
     """
 
     @property
@@ -38,6 +38,8 @@ class MarkovDecisionProcess(Protocol):
     def same_action(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]: ...
 
     def parts_of(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]: ...
+
+    def places_of(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]: ...
 
 
 def goal_values(

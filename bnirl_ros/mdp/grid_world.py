@@ -108,6 +108,10 @@ class GridWorld:
         parts, _ = label(self.free)
         return np.asarray(parts.reshape(-1)[states], dtype=np.int64)
 
+    def places_of(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """(U, 2) where each state lies: its cell."""
+        return self.cells_of(states)
+
     def outcomes(self) -> npt.NDArray[np.int64]:
         """(S, A) state to which each action leads from each state when it succeeds."""
         states = np.arange(self.state_count)[:, None]

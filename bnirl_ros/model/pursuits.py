@@ -91,6 +91,7 @@ class PursuitModel:
         state_part: (U,) int64 connected part of the map in which each state lies.
         candidate_part: (G,) int64 the same for the candidates: only those of the same part are
             ever pursued, so P(g) and the urn are each part's own.
+        place: (G, 2) int64 cell of each candidate.
         fixed: values of the parameters in `PRIORS` that are not inferred.
         priors: of the parameters that are.
     """
@@ -102,6 +103,7 @@ class PursuitModel:
     arrived: npt.NDArray[np.bool_]
     state_part: npt.NDArray[np.int64]
     candidate_part: npt.NDArray[np.int64]
+    place: npt.NDArray[np.int64]
     fixed: Mapping[str, float]
     priors: Mapping[str, Prior]
 
@@ -230,6 +232,7 @@ def pursuit_model(
         arrived=visited[:, None] == goals if arrived is None else arrived,
         state_part=state_part,
         candidate_part=candidate_part,
+        place=mdp.places_of(goals),
         fixed=dict(fixed or {}),
         priors=priors,
     )
