@@ -18,6 +18,7 @@ from bnirl_ros.inference.posterior import Posterior
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.inference.summary import Subgoal, Summary
 from bnirl_ros.maps.grid_map import GridMap
+from bnirl_ros.model.pursuits import PRIORS
 from bnirl_ros.views.plot import draw_summary
 from bnirl_ros.views.pursuits import knows_pursuits, pursuits_by_episode
 
@@ -182,8 +183,8 @@ def subgoals_in(document: Mapping[str, Any]) -> tuple[Subgoal, ...]:
 
 
 def posterior_arrays(posterior: Posterior) -> dict[str, npt.NDArray[Any]]:
-    """The arrays of posterior.npz."""
-    return {
+    """The arrays of posterior.npz: those of the sequential model tell its parameters, too."""
+    arrays: dict[str, npt.NDArray[Any]] = {
         "candidates": posterior.candidates,
         "observations": posterior.demonstration.observations,
         "subgoal_of": posterior.draws.subgoal_of,
@@ -192,6 +193,10 @@ def posterior_arrays(posterior: Posterior) -> dict[str, npt.NDArray[Any]]:
         "mode_subgoal_of": posterior.mode.subgoal_of,
         "mode_partition_of": posterior.mode.partition_of,
     }
+    if posterior.settings.model == "sequential":
+        arrays["parameters"] = posterior.draws.parameters
+        arrays["parameter_names"] = np.array(list(PRIORS))
+    return arrays
 
 
 def write_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
