@@ -167,7 +167,10 @@ class SubgoalFilter:
         self._model = pursuit_model_of(every, self.candidates, grid_map, posterior.settings)
         self._kernel = kernel_model(self._model)
         self._chosen = softmax_table(self._kernel, self._parameters[0])
-        self._row_of_state = {int(state): row for row, state in enumerate(states)}
+        # By cell: the number of a state tells nothing of a cell beyond the map's edge.
+        self._row_of_cell = {
+            (int(x), int(y)): row for row, (x, y) in enumerate(self._world.cells_of(states))
+        }
         self._belief: npt.NDArray[np.float64] | None = None
         self._row = 0
 
@@ -183,12 +186,16 @@ class SubgoalFilter:
             action: index into `ACTION_NAMES`.
 
         Raises:
-            InputError: the cell is not free, or no candidate can be reached from it.
+            InputError: the cell is not free, or no candidate can be reached from it, or there is
+                no such action.
         """
-        row = self._row_of_state.get(int(self._world.states_of(cell)[0]))
+        x, y = (int(coordinate) for coordinate in np.asarray(cell).reshape(2))
+        row = self._row_of_cell.get((x, y))
         if row is None:
-            raise InputError(f"cell {cell}: no candidate can be reached from it")
+            raise InputError(f"cell ({x}, {y}): no candidate can be reached from it")
         actions = self._world.actions
+        if action not in actions:
+            raise InputError(f"action {action}: is none of {', '.join(map(str, actions))}")
         pair = self._kernel.pair_of[row * len(actions) + np.searchsorted(actions, action)]
         starts = self._belief is None
         here = self._model.candidate_part == self._model.state_part[row]
