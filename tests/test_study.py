@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations, pairwise
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -48,7 +50,9 @@ from bnirl_ros.inference.summary import Pursuit, Subgoal, Summary, nothing_found
 from bnirl_ros.maps import GridMap
 from bnirl_ros.mdp.actions import ACTION_NAMES, STEPS
 from bnirl_ros.mdp.goal_values import goal_values
+from bnirl_ros.mdp.grid_world import GridWorld
 from bnirl_ros.model.likelihood import action_log_likelihood
+from bnirl_ros.model.pursuits import PursuitModel, pursuit_model
 
 # What is found against what is true
 
@@ -139,6 +143,21 @@ def test_tables_are_markdown() -> None:
 def test_the_settings_are_the_shipped_ones_but_for_the_chains() -> None:
     for model in MODELS:
         assert replace(settings_of(model), chains=Settings().chains) == Settings(model=model)
+    # The sequential model's parameters are inferred, so that nobody tunes anything.
+    assert settings_of("sequential").fixed == {}
+    assert settings_of("paper").fixed == {"alpha": 50.0, "eta": 1.0}
+    given = {"eta": 2.0, "slip": 0.0}
+    assert settings_of("sequential", **given).fixed == given
+    assert settings_of("paper", eta=2.0).fixed == {"alpha": 50.0, "eta": 2.0}
+
+
+def shortly(monkeypatch: pytest.MonkeyPatch, part: ModuleType) -> None:
+    """Let the cases of a part sweep for a short while."""
+
+    def short(model: str, **others: Any) -> Settings:
+        return settings_of(model, **(others | {"sweeps": 60, "burn_in": 20}))
+
+    monkeypatch.setattr(part, "settings_of", short)
 
 
 # The turtle
@@ -172,11 +191,28 @@ def test_score_of_the_turtle() -> None:
     assert (score.visited, score.in_order) == ([2, 0, 1, 0], False)
 
 
-def test_the_table_of_the_turtle() -> None:
-    result = turtle.run("paper")
-    assert len(result["positions"]) == result["found"] + result["strays"] + result["duplicates"]
-    ((model, found, *_),) = turtle.table([result]).rows
-    assert (model, found) == ("paper", f"{result['found']} of 6")
+def test_the_turtle_is_told_of_every_model_and_seed() -> None:
+    cases = turtle.cases(Path())
+    assert [case.model for case in cases] == [each for each in MODELS for _ in range(10)]
+    assert [case.seed for case in cases] == [*range(10)] * len(MODELS)
+
+
+def test_the_table_of_the_turtle(monkeypatch: pytest.MonkeyPatch) -> None:
+    shortly(monkeypatch, turtle)
+    results = [turtle.run(turtle.Case(model, seed=3)) for model in MODELS]
+    for model, result in zip(MODELS, results, strict=True):
+        assert (result["model"], result["seed"]) == (model, 3)
+        found = result["found"] + result["strays"] + result["duplicates"]
+        assert len(result["positions"]) == found
+    rows = turtle.table(results).rows
+    assert [row[:2] for row in rows] == [
+        (model, f"{result['found']} of 6") for model, result in zip(MODELS, results, strict=True)
+    ]
+    # Least and most of several seeds.
+    other = results[0] | {"seed": 4, "found": 2, "strays": 9, "in_order": True}
+    result = results[0] | {"found": 6, "strays": 1, "in_order": False}
+    ((model, found, strays, _, in_order),) = turtle.table([result, other]).rows
+    assert (model, found, strays, in_order) == (MODELS[0], "2-6 of 6", "1-9", "1 of 2 times")
 
 
 # The kitchens
@@ -244,7 +280,7 @@ def test_frequencies_are_those_of_outcomes() -> None:
 
 
 def test_the_papers_prediction_is_the_urn_over_its_draws() -> None:
-    settings = Settings(sweeps=30, burn_in=10, chains=2, alpha=1.0, eta=0.5)
+    settings = Settings(model="paper", sweeps=30, burn_in=10, chains=2, alpha=1.0, eta=0.5)
     learnt = in_corridor(*[(0, 0, "E"), (0, 1, "stay"), (0, 1, "W")] * 2)
     held_out = in_corridor((2, 0, "E"), (2, 1, "W"))
     posterior = infer(learnt, CORRIDOR, settings)
@@ -261,13 +297,40 @@ def test_the_papers_prediction_is_the_urn_over_its_draws() -> None:
     assert np.exp(foreseen) == pytest.approx(expected)
 
 
-def test_all_outcomes_together_are_certain() -> None:
-    settings = Settings(sweeps=30, burn_in=10, chains=1)
-    posterior = infer(in_corridor((0, 0, "E"), (0, 1, "W")), CORRIDOR, settings)
-    either = in_corridor((2, 0, "E"), (2, 0, "stay"))
-    foreseen = next_action.predict_exchangeable(posterior, either, CORRIDOR, settings)
-    alike = next_action.actions_alike(either, grid_world(CORRIDOR, settings))
-    assert (np.exp(foreseen) * alike).sum() == pytest.approx(1.0)
+def test_every_model_foresees() -> None:
+    assert list(next_action.PREDICTORS) == list(MODELS)
+    assert list(reliability.SIMULATORS) == list(MODELS)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_all_outcomes_together_are_certain(model: str) -> None:
+    settings = Settings(model=model, sweeps=30, burn_in=10, chains=1)
+    learnt = in_corridor((0, 0, "E"), (0, 1, "stay"), (0, 1, "W"), (0, 0, "E"))
+    posterior = infer(learnt, CORRIDOR, settings)
+    # Whatever came before in the episode, and whatever else leads to the same cell.
+    for before in ([], [(2, 1, "stay")], [(2, 0, "E"), (2, 1, "N"), (2, 1, "W")]):
+        for x, outcomes in ((0, ("E", "stay")), (0, ("E", "SW")), (1, ("W", "E"))):
+            probability = 0.0
+            for name in outcomes:
+                episode = in_corridor(*before, (2, x, name))
+                predict = next_action.PREDICTORS[model]
+                foreseen = predict(posterior, episode, CORRIDOR, settings)
+                assert foreseen.shape == (len(episode),)
+                probability += np.exp(foreseen[-1])
+            assert probability == pytest.approx(1.0)
+
+
+def test_what_an_episode_did_so_far_counts_for_the_sequential_model_alone() -> None:
+    learnt = in_corridor(*[(0, 0, "E"), (0, 1, "W")] * 5)
+    held_out = [in_corridor((2, 0, first), (2, 0, "E")) for first in ("E", "stay")]
+    last = {}
+    for model in MODELS:
+        settings = Settings(model=model, sweeps=60, burn_in=20, chains=1)
+        posterior = infer(learnt, CORRIDOR, settings)
+        predict = next_action.PREDICTORS[model]
+        last[model] = [predict(posterior, each, CORRIDOR, settings)[-1] for each in held_out]
+    assert last["paper"][0] == last["paper"][1]
+    assert last["sequential"][0] > last["sequential"][1] + 0.1
 
 
 def test_players_of_a_trial_stay_together() -> None:
@@ -368,13 +431,15 @@ def test_standing_still_is_all_that_a_pause_adds() -> None:
     assert 0.35 < stays.mean() < 0.6
 
 
-def test_a_case_of_the_robustness_table() -> None:
-    case = robustness.Case("paper", "as assumed", 0)
+@pytest.mark.parametrize("model", MODELS)
+def test_a_case_of_the_robustness_table(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
+    monkeypatch.setattr(robustness, "SWEEPS", {"sweeps": 60, "burn_in": 20})
+    case = robustness.Case(model, "as assumed", 0)
     result = robustness.run(case)
     assert result == robustness.run(case)
     assert result["exact"] <= result["near"] <= min(result["true"], result["found"])
-    ((name, model, *cells),) = robustness.table([result]).rows
-    assert (name, model, len(cells)) == ("as assumed", "paper", 5)
+    ((name, told, *cells),) = robustness.table([result]).rows
+    assert (name, told, len(cells)) == ("as assumed", model, 5)
     assert cells[0].startswith(f"{100 * result['exact'] / result['true']:.0f} (")
 
 
@@ -416,7 +481,7 @@ def test_the_band_holds_where_statements_depend_on_each_other() -> None:
     assert not any(each.holds for each in wrong)
 
 
-def test_the_simulated_prior_is_the_urns() -> None:
+def test_the_papers_simulated_prior_is_the_urns() -> None:
     generator = np.random.default_rng(0)
     sizes = []
     for _ in range(300):
@@ -429,11 +494,138 @@ def test_the_simulated_prior_is_the_urns() -> None:
     assert partitions * 0.8 < np.mean(sizes) < partitions
 
 
-def test_a_case_of_the_reliability_table() -> None:
-    result = reliability.run(reliability.Case("paper", 0))
+def fix_parameters(monkeypatch: pytest.MonkeyPatch, **values: float) -> None:
+    """Let the prior of some parameters be a single value."""
+
+    class Value:
+        def __init__(self, value: float) -> None:
+            self.value = value
+
+        def draw(self, generator: np.random.Generator) -> float:
+            return self.value
+
+    def fixed_model(*arguments: Any) -> PursuitModel:
+        model = pursuit_model(*arguments)
+        return replace(
+            model, priors=model.priors | {name: Value(each) for name, each in values.items()}
+        )
+
+    monkeypatch.setattr(reliability, "pursuit_model", fixed_model)
+
+
+ALL_AT_ONCE = {"switch_on_arrival": 1.0, "switch_at_subgoal": 1.0, "switch_elsewhere": 1.0}
+SURELY = {"alpha": 1e3, "slip": 0.0, "switch_on_arrival": 1.0, "switch_elsewhere": 0.0}
+
+
+def test_the_simulated_prior_of_the_sequential_model_is_the_urns(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    fix_parameters(monkeypatch, eta=1.0, slip=0.0, **ALL_AT_ONCE)
+    generator = np.random.default_rng(0)
+    sizes = [len(reliability.simulate_in_sequence(generator)[2]) for _ in range(100)]
+    # A draw at each of 80 observations, some of the partitions sharing a subgoal by chance.
+    partitions = (1.0 / np.arange(1, 81)).sum()
+    assert partitions * 0.8 < np.mean(sizes) < partitions
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_the_truth_of_a_simulated_sequence_is_what_was_pursued(
+    monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    # Who does not err, and goes on until it is there, takes the best action for one of the true
+    # subgoals, each of which explains some.
+    fix_parameters(monkeypatch, eta=2.0, switch_at_subgoal=1.0, **SURELY)
+    demonstration, grid_map, truth = reliability.simulate_in_sequence(np.random.default_rng(seed))
+    assert len(demonstration) == 80
+    assert demonstration.episode.tolist() == [0] * 40 + [1] * 40
+    assert grid_map.is_free(np.concatenate([demonstration.cells, truth])).all()
+    world = grid_world(grid_map, Settings())
+    steps = np.diff(world.states_of(demonstration.cells))
+    assert np.isin(np.delete(steps, 39), [0, *world.offsets]).all()
+    best = best_actions(demonstration, truth, world)
+    assert best.any(axis=1).all()
+    assert best.any(axis=0).all()
+    # It arrives at each but perhaps the last of an episode.
+    visited = {tuple(cell) for cell in demonstration.cells.tolist()}
+    assert len(set(truth) - visited) <= 2
+
+
+def best_actions(
+    demonstration: Demonstration, subgoals: list[tuple[int, int]], world: GridWorld
+) -> npt.NDArray[np.bool_]:
+    """(N, J) whether each action is, nearly, a best one for each subgoal."""
+    states = world.states_of(demonstration.cells)
+    values = goal_values(world, world.states_of(subgoals), states)
+    chosen = values[np.arange(len(states)), np.searchsorted(world.actions, demonstration.action)]
+    return chosen > values.max(axis=1) * 0.999
+
+
+def test_one_subgoal_is_pursued_again_and_again_where_eta_is_tiny(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    fix_parameters(monkeypatch, eta=1e-12, switch_at_subgoal=0.5, **SURELY)
+    demonstration, grid_map, truth = reliability.simulate_in_sequence(np.random.default_rng(0))
+    assert len(truth) == 1
+    assert best_actions(demonstration, truth, grid_world(grid_map, Settings())).all()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_who_never_switches_pursues_one_subgoal_an_episode(
+    monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    never = SURELY | {"switch_on_arrival": 0.0, "switch_at_subgoal": 0.0}
+    fix_parameters(monkeypatch, eta=1e12, **never)
+    demonstration, grid_map, truth = reliability.simulate_in_sequence(np.random.default_rng(seed))
+    best = best_actions(demonstration, truth, grid_world(grid_map, Settings()))
+    of_episodes = [best[:40].all(axis=0), best[40:].all(axis=0)]
+    assert 1 <= len(truth) <= 2
+    assert all(whole.any() for whole in of_episodes)
+    assert np.any(of_episodes, axis=0).all()
+
+
+def test_a_simulated_demonstrator_stays_as_long_as_its_switches_say(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # It leaves as it arrives, after one action there, or never.
+    fix_parameters(monkeypatch, eta=1e12, switch_at_subgoal=1.0, **SURELY)
+    passing = stays_of_simulations()
+    fix_parameters(
+        monkeypatch, eta=1e12, switch_at_subgoal=1.0, **(SURELY | {"switch_on_arrival": 0.0})
+    )
+    pausing = stays_of_simulations()
+    fix_parameters(
+        monkeypatch, eta=1e12, switch_at_subgoal=0.0, **(SURELY | {"switch_on_arrival": 0.0})
+    )
+    resting = stays_of_simulations()
+    assert passing < 0.05 < pausing < 0.45 < resting
+
+
+def stays_of_simulations() -> float:
+    """Share of staying among the actions of some simulated demonstrations."""
+    simulated = [
+        reliability.simulate_in_sequence(np.random.default_rng(seed))[0] for seed in range(10)
+    ]
+    actions = np.concatenate([demonstration.action for demonstration in simulated])
+    return float((actions == ACTION_NAMES.index("stay")).mean())
+
+
+def test_what_only_slips_pursued_is_no_subgoal(monkeypatch: pytest.MonkeyPatch) -> None:
+    fix_parameters(monkeypatch, slip=1.0)
+    demonstration, _, truth = reliability.simulate_in_sequence(np.random.default_rng(0))
+    assert (len(demonstration), truth) == (80, [])
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_case_of_the_reliability_table(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
+    short = reliability.SAMPLING | {"sweeps": 100, "burn_in": 20}
+    monkeypatch.setattr(reliability, "SAMPLING", short)
+    result = reliability.run(reliability.Case(model, 0))
+    assert result == reliability.run(reliability.Case(model, 0))
     assert len(result["stated"]) == len(result["true"])
-    assert sum(result["true"]) >= 1
-    assert len(reliability.table([result]).rows) == len(reliability.EDGES) - 1
+    assert 1 <= sum(result["true"]) < len(result["true"])
+    table = reliability.table([result])
+    assert len(table.rows) == len(reliability.EDGES) - 1
+    assert all(row[0] == model for row in table.rows)
 
 
 def test_the_demonstration_for_the_cost_is_as_long_as_said() -> None:
@@ -447,13 +639,15 @@ def test_the_demonstration_for_the_cost_is_as_long_as_said() -> None:
 
 
 def test_the_command_writes_tables_and_numbers(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.setattr(turtle, "SEEDS", 1)
     out = tmp_path / "deep" / "study.md"
     arguments = ["--only", "turtle", "--only", "overcooked", "--jobs", "1", "--out", str(out)]
     assert main([*arguments, "--overcooked", str(tmp_path / "nowhere")]) == 1
     printed = capsys.readouterr()
-    assert "turtle: 1 of " in printed.out or "turtle: 2 of " in printed.out
+    assert "turtle: 1 of 2" in printed.out
+    assert "turtle: 2 of 2" in printed.out
     assert printed.err.startswith("overcooked: left out: ")
     assert out.read_text(encoding="utf-8").startswith("### A turtle driven")
     numbers = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
@@ -463,6 +657,7 @@ def test_the_command_writes_tables_and_numbers(
 def test_without_recordings_the_rest_is_done(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.setattr(turtle, "SEEDS", 1)
     two = {name: PARTS[name] for name in ("overcooked", "turtle")}
     monkeypatch.setattr("bnirl_ros.experiments.study.__main__.PARTS", two)
     arguments = ["--jobs", "1", "--out", str(tmp_path / "study.md")]
