@@ -20,14 +20,14 @@ import numpy as np
 from bnirl_ros.bags.demonstration import read_demonstration
 from bnirl_ros.demonstrations.placement import place
 from bnirl_ros.inference.chains import run_chains
-from bnirl_ros.inference.mode import posterior_mode
-from bnirl_ros.inference.posterior import infer, paper_model
+from bnirl_ros.inference.posterior import infer, mode_of, model_of
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.mdp.goal_values import goal_values
 from bnirl_ros.mdp.grid_world import GridWorld
 from bnirl_ros.resources import share_folder
 
-BAGS = {"paper_loop": Settings(), "overcooked_random3": Settings(alpha=5.0)}
+BAGS = ("paper_loop", "overcooked_random3")
+MODELS = ("sequential", "paper")
 
 
 def timed(what: str, runs: int, run: Callable[[], object]) -> None:
@@ -43,7 +43,7 @@ def timed(what: str, runs: int, run: Callable[[], object]) -> None:
 
 def command(bag: Path, settings: Settings, out: Path) -> None:
     """`bnirl infer` as a process of its own, start of the interpreter included."""
-    arguments = ["infer", str(bag), "--out", str(out), "--alpha", str(settings.alpha)]
+    arguments = ["infer", str(bag), "--out", str(out), "--model", settings.model]
     subprocess.run(
         [sys.executable, "-m", "bnirl_ros.cli", *arguments], check=True, stdout=subprocess.DEVNULL
     )
@@ -56,12 +56,12 @@ def benchmark_bag(name: str, settings: Settings) -> None:
     assert recorded.grid_map is not None
     grid_map = recorded.grid_map
     demonstration = place(recorded.recording, grid_map).demonstration
-    _, mixture = paper_model(demonstration, grid_map, settings)
-    draws = run_chains(mixture, settings)
-    print(f"{name}: {len(demonstration)} observations")
+    _, model = model_of(demonstration, grid_map, settings)
+    draws = run_chains(model, settings)
+    print(f"{name}, {settings.model} model: {len(demonstration)} observations")
     timed("  read", 5, lambda: read_demonstration(bag, {}))
-    timed("  4 chains of 1000 sweeps", 5, lambda: run_chains(mixture, settings))
-    timed("  mode", 5, lambda: posterior_mode(mixture, draws))
+    timed("  4 chains of 1000 sweeps", 5, lambda: run_chains(model, settings))
+    timed("  mode", 5, lambda: mode_of(model, draws))
     with tempfile.TemporaryDirectory() as out:
         timed("  bnirl infer, as a process", 5, lambda: command(bag, settings, Path(out)))
     posterior = infer(demonstration, grid_map, settings)
@@ -74,8 +74,9 @@ def main() -> None:
     world = GridWorld(np.ones((20, 20), dtype=bool))
     states = np.arange(400)
     timed("100 goals on 20 x 20 cells", 20, lambda: goal_values(world, states[:100], states))
-    for name, settings in BAGS.items():
-        benchmark_bag(name, settings)
+    for name in BAGS:
+        for model in MODELS:
+            benchmark_bag(name, Settings(model=model))
 
 
 if __name__ == "__main__":

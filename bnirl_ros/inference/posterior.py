@@ -122,6 +122,13 @@ def pursuit_model_of(
     )
 
 
+def mode_of(model: Model, draws: Draws) -> Mode:
+    """The posterior mode of a model, from draws (chain, draw, N)."""
+    if isinstance(model, SubgoalMixture):
+        return mode.posterior_mode(model, draws)
+    return pursuit_mode.posterior_mode(model, draws)
+
+
 def posterior_of(
     candidates: npt.NDArray[np.int64],
     demonstration: Demonstration,
@@ -137,11 +144,7 @@ def posterior_of(
         candidates=candidates,
         demonstration=demonstration,
         draws=draws,
-        mode=(
-            mode.posterior_mode(model, draws)
-            if isinstance(model, SubgoalMixture)
-            else pursuit_mode.posterior_mode(model, draws)
-        ),
+        mode=mode_of(model, draws),
         settings=settings,
         rhat=max(rhats, default=None),
         ess=min(sizes, default=None),

@@ -8,7 +8,7 @@ A sweep draws, each given all else:
    integrated out: held as a variable they would keep a candidate that is in no pursuit from ever
    being tried. A switch depends on the old subgoal through rho alone, so that an observation costs
    O(G), not O(G^2). Blocks differ in length from sweep to sweep;
-2. the place of one subgoal, with all paths open;
+2. the place of a subgoal, with all paths open;
 3. the switch probabilities, together with the switches to the same subgoal again, and eta, all
    parameters by slice sampling;
 4. partitions, given the subgoals, by the Chinese restaurant process that the urn collapses, and
@@ -33,7 +33,8 @@ _SHORTEST_BLOCK, _LONGEST_BLOCK = 8, 1024  # observations; their logarithm is un
 _BLOCK_ENTRIES = 4_000_000  # of the forward messages: shorter blocks where candidates are many
 _SLICE = 0.7  # first width of a slice, of a logarithm
 _CONFIDENCE_PERIOD = 4  # sweeps between two draws of alpha, where those cost more than the rest
-_RELOCATED = 2000  # observations, beyond which a subgoal is relocated less than once in a sweep
+_RELOCATED = 4000  # observations, beyond which a subgoal is relocated less than once in a sweep
+_RELOCATIONS = 4  # in a sweep over few observations
 _HEAVY = 1e-6  # a weight above which a candidate's place matters to a relocation
 _FARTHEST = 27.0  # logarithms and logits are not sought beyond
 _RAREST = 1e-12  # probabilities stay off 0 and 1, which would rule out what is only improbable
@@ -247,11 +248,13 @@ def _advance(model, state, generator, thin, subgoal_of, partition_of, log_joint,
     states, actions = model.cost.shape[:2]
     period = 1 if states * actions <= label.shape[0] else _CONFIDENCE_PERIOD
     relocation_period = 1 + label.shape[0] // _RELOCATED
+    relocations = min(1 + _RELOCATED // (1 + label.shape[0]), _RELOCATIONS)
     for draw in range(log_joint.shape[0]):
         for _ in range(thin):
             _draw_blocks(model, state, chosen, forward, generator)
             if state.sweeps[0] % relocation_period == 0:
-                _relocate(model, state, chosen, generator)
+                for _again in range(relocations):
+                    _relocate(model, state, chosen, generator)
             # Partitions depend on eta and on the switches, whose draws have them integrated out:
             # they come after these.
             _draw_switches(model, state, generator)

@@ -10,7 +10,7 @@ from typing import Any
 from bnirl_ros.errors import InputError
 from bnirl_ros.model.candidates import CANDIDATE_KINDS
 from bnirl_ros.model.likelihood import LIKELIHOODS
-from bnirl_ros.model.pursuits import PRIORS
+from bnirl_ros.model.pursuits import PRIORS, VALUE_ALPHA
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,9 @@ class Limits:
 
 PAPER_PARAMETERS = {"alpha": 50.0, "eta": 1.0}
 """What the paper's model takes where nothing is given: it infers neither."""
+
+SEQUENTIAL_ONLY = {*PRIORS} - {*PAPER_PARAMETERS} | {"arrival_radius", "likelihood"}
+"""Settings that only the sequential model has."""
 
 
 def _setting(default: Any, description: str, **limits: Any) -> Any:
@@ -125,7 +128,8 @@ class Settings:
     )
     likelihood: str = _setting(
         "delay",
-        "what actions of the sequential model cost: steps, or value as in equation (7)",
+        "what actions of the sequential model cost: steps, or value as in equation (7); with "
+        f"value the prior of alpha is {VALUE_ALPHA}",
         choices=LIKELIHOODS,
     )
     sweeps: int = _setting(1000, "sweeps of each chain, burn-in included", lowest=1)
@@ -161,11 +165,22 @@ class Settings:
             fault = limits_of(setting).fault(setting.name, getattr(self, setting.name))
             if fault:
                 raise InputError(fault)
+        if self.model == "paper":
+            self._refuse_what_the_paper_does_not_know()
         if self.draws < 1:
             raise InputError(
                 f"sweeps must leave a draw: {self.sweeps} sweeps less {self.burn_in} of burn-in "
                 f"hold none at thin {self.thin}"
             )
+
+    def _refuse_what_the_paper_does_not_know(self) -> None:
+        for setting in fields(self):
+            sequential = setting.name in SEQUENTIAL_ONLY
+            if sequential and getattr(self, setting.name) != setting.default:
+                raise InputError(
+                    f"{setting.name} is no setting of the paper's model; leave it out, or take "
+                    "the sequential model"
+                )
 
     @property
     def fixed(self) -> dict[str, float]:

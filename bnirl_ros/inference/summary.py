@@ -258,24 +258,16 @@ def _visits(pursuits: Sequence[Pursuit]) -> list[list[int]]:
 
 
 def _repetitions(visits: Sequence[Sequence[int]]) -> int:
-    """How often the visits go round one loop; 0 where they don't, or only once.
+    """How often the visits go round one loop of two subgoals or more; 0 for once, or no loop.
 
     Every episode begins the loop anew; its last time round may break off.
     """
-    longest = max(visits, key=len, default=())
-    for period in range(1, len(longest)):
-        loop = longest[:period]
-        if len(set(loop)) == period and all(
-            rank == loop[place % period]
-            for episode in visits
-            for place, rank in enumerate(episode)
-        ):
-            break
-    else:
-        loop = longest
-        if len(set(loop)) < len(loop) or any(list(loop[: len(e)]) != list(e) for e in visits):
-            return 0
-    rounds = sum(len(episode) // max(len(loop), 1) for episode in visits)
+    loop = list(dict.fromkeys(visits[0])) if visits else []
+    if len(loop) < 2 or any(
+        rank != loop[place % len(loop)] for episode in visits for place, rank in enumerate(episode)
+    ):
+        return 0
+    rounds = sum(len(episode) // len(loop) for episode in visits)
     return rounds if rounds > 1 else 0
 
 
