@@ -279,7 +279,7 @@ def test_after_a_replay_human_play_gives_the_posterior_of_the_command(
     whole = place(recorded.recording, recorded.grid_map).demonstration
     bag = tmp_path / "human"
     write_demonstration(bag, first_episodes(whole, 2), recorded.grid_map, step=0.15)
-    replay_and_compare(bag, {"sweeps": 400, "burn_in": 100}, tmp_path, start, subgoals)
+    replay_and_compare(bag, {"sweeps": 2000, "burn_in": 500}, tmp_path, start, subgoals)
 
 
 # What it publishes

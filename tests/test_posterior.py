@@ -242,6 +242,7 @@ def test_the_samplers_take_any_finite_mdp() -> None:
     np.testing.assert_allclose(model.cost, in_sequence.cost, atol=1e-6)
     np.testing.assert_array_equal(model.action_of, in_sequence.action_of)
     np.testing.assert_array_equal(model.arrived, in_sequence.arrived)
+    model = replace(model, place=in_sequence.place)  # of which a finite MDP knows nothing
     draws, on_map = run_chains(model, QUICK), run_chains(in_sequence, QUICK)
     np.testing.assert_array_equal(draws.subgoal_of, on_map.subgoal_of)
 

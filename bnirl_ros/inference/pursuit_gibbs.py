@@ -264,8 +264,9 @@ def _advance(model, state, generator, thin, subgoal_of, partition_of, log_joint,
             _draw_action_parameters(model, state, chosen, confidence_too, generator)
             if confidence_too and not model.is_fixed[ALPHA]:
                 chosen = softmax_table(model, state.parameters[ALPHA])
+            # For the record only, but in every sweep: thinning chooses sweeps of the same chain.
+            _draw_slips(model, state, chosen, generator)
             state.sweeps[0] += 1
-        _draw_slips(model, state, chosen, generator)
         log_joint[draw] = log_joint_of(model, state, chosen)
         parameters[draw] = state.parameters
         label[:] = -1
