@@ -39,3 +39,15 @@ class Demonstration:
     def observations(self) -> npt.NDArray[np.int64]:
         """(N, 4) int64: episode, x, y, action index."""
         return np.column_stack([self.episode, self.cells, self.action])
+
+    def of_episodes(self, episodes: npt.ArrayLike) -> Demonstration:
+        """What was seen in the episodes with these numbers, which they keep."""
+        observed = np.isin(self.episode, episodes)
+        ended = np.isin(self.last_episode, episodes)
+        return Demonstration(
+            episode=self.episode[observed],
+            cells=self.cells[observed],
+            action=self.action[observed],
+            last_episode=self.last_episode[ended],
+            last_cells=self.last_cells[ended],
+        )

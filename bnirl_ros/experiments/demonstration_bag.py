@@ -85,16 +85,7 @@ def _poses(
 
 def first_episodes(demonstration: Demonstration, count: int) -> Demonstration:
     """The first so many episodes of a demonstration."""
-    kept = np.unique(demonstration.episode)[:count]
-    observed = np.isin(demonstration.episode, kept)
-    ended = np.isin(demonstration.last_episode, kept)
-    return Demonstration(
-        episode=demonstration.episode[observed],
-        cells=demonstration.cells[observed],
-        action=demonstration.action[observed],
-        last_episode=demonstration.last_episode[ended],
-        last_cells=demonstration.last_cells[ended],
-    )
+    return demonstration.of_episodes(np.unique(demonstration.episode)[:count])
 
 
 def write_what_fits(

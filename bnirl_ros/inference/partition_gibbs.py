@@ -19,7 +19,7 @@ import numpy.typing as npt
 from numba import njit
 
 from bnirl_ros.inference.draws import Draws
-from bnirl_ros.inference.random_draws import categorical
+from bnirl_ros.inference.kernels import categorical, number_in_order
 from bnirl_ros.model.mixture import SubgoalMixture
 
 
@@ -155,22 +155,16 @@ def advance(
 @njit(nogil=True, cache=True)
 def _advance(model, state, generator, thin, subgoal_of, partition_of, log_joint):  # type: ignore[no-untyped-def]
     everyone = np.arange(state.partition_of.shape[0])
-    label_of_slot = np.empty(state.partition_of.shape[0], dtype=np.int32)
+    scratch = np.empty(state.partition_of.shape[0], dtype=np.int32)
     for draw in range(log_joint.shape[0]):
         for _ in range(thin):
             _draw_subgoals(model, state, generator)
             _draw_partitions(model, state, everyone, generator)
             _redraw_partitions(model, state, generator)
         log_joint[draw] = _log_joint(model, state)
-        label_of_slot[:] = -1
-        labels = 0
-        for i in range(state.partition_of.shape[0]):
-            slot = state.partition_of[i]
-            if label_of_slot[slot] < 0:
-                label_of_slot[slot] = labels
-                labels += 1
-            partition_of[draw, i] = label_of_slot[slot]
-            subgoal_of[draw, i] = state.subgoal_of_slot[slot]
+        partition_of[draw] = state.partition_of
+        number_in_order(partition_of[draw], scratch)
+        subgoal_of[draw] = state.subgoal_of_slot[state.partition_of]
 
 
 @njit(nogil=True, cache=True)

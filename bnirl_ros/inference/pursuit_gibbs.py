@@ -26,7 +26,7 @@ import numpy.typing as npt
 from numba import njit
 
 from bnirl_ros.inference.draws import Draws
-from bnirl_ros.inference.random_draws import categorical
+from bnirl_ros.inference.kernels import categorical, count_draws, number_in_order
 from bnirl_ros.model.pursuits import PRIORS, PursuitModel
 
 _SHORTEST_BLOCK, _LONGEST_BLOCK = 8, 1024  # observations; their logarithm is uniform
@@ -243,12 +243,12 @@ def _advance(model, state, generator, thin, subgoal_of, partition_of, log_joint,
     longest = max(_SHORTEST_BLOCK, min(_LONGEST_BLOCK, _BLOCK_ENTRIES // candidates))
     forward = np.empty((longest, candidates))
     chosen = softmax_table(model, state.parameters[ALPHA])
-    label = np.empty(state.subgoal_of.shape[0], dtype=np.int32)
+    scratch = np.empty(state.subgoal_of.shape[0], dtype=np.int32)
     # A draw of alpha takes a new table, an exponential for each of its states and actions.
     states, actions = model.cost.shape[:2]
-    period = 1 if states * actions <= label.shape[0] else _CONFIDENCE_PERIOD
-    relocation_period = 1 + label.shape[0] // _RELOCATED
-    relocations = min(1 + _RELOCATED // (1 + label.shape[0]), _RELOCATIONS)
+    period = 1 if states * actions <= scratch.shape[0] else _CONFIDENCE_PERIOD
+    relocation_period = 1 + scratch.shape[0] // _RELOCATED
+    relocations = min(1 + _RELOCATED // (1 + scratch.shape[0]), _RELOCATIONS)
     for draw in range(log_joint.shape[0]):
         for _ in range(thin):
             _draw_blocks(model, state, chosen, forward, generator)
@@ -269,19 +269,9 @@ def _advance(model, state, generator, thin, subgoal_of, partition_of, log_joint,
             state.sweeps[0] += 1
         log_joint[draw] = log_joint_of(model, state, chosen)
         parameters[draw] = state.parameters
-        label[:] = -1
-        labels = 0
-        for t in range(label.shape[0]):
-            if state.slipped[t]:
-                subgoal_of[draw, t] = -1
-                partition_of[draw, t] = -1
-                continue
-            partition = state.partition_of[t]
-            if label[partition] < 0:
-                label[partition] = labels
-                labels += 1
-            partition_of[draw, t] = label[partition]
-            subgoal_of[draw, t] = state.subgoal_of[t]
+        partition_of[draw] = np.where(state.slipped, np.int32(-1), state.partition_of)
+        number_in_order(partition_of[draw], scratch)
+        subgoal_of[draw] = np.where(state.slipped, np.int32(-1), state.subgoal_of)
 
 
 @njit(nogil=True, cache=True)
@@ -427,9 +417,7 @@ def _draw_block(model, state, chosen, forward, first, end, generator):  # type: 
     theta, parameters, counts = state.subgoal_of, state.parameters, state.counts
     goes_on = end < model.starts.shape[0] and not model.starts[end]
     last = end + 1 if goes_on else end
-    for t in range(first, last):
-        if state.switched[t]:
-            counts[theta[t]] -= 1
+    count_draws(counts, theta[first:last], state.switched[first:last], -1)
     part = model.state_part[model.state_of[first]]
     weights = urn_weights(model, parameters[ETA], counts, part)
 
@@ -443,9 +431,7 @@ def _draw_block(model, state, chosen, forward, first, end, generator):  # type: 
     if ratio >= 0.0 or generator.random() < math.exp(ratio):
         theta[first:last] = new_theta
         state.switched[first:last] = new_switched
-    for t in range(first, last):
-        if state.switched[t]:
-            counts[theta[t]] += 1
+    count_draws(counts, theta[first:last], state.switched[first:last], 1)
 
 
 @njit(nogil=True, cache=True)
@@ -522,9 +508,7 @@ def urn_ratio(model, eta, counts, weights, theta, switched):  # type: ignore[no-
         ratio += math.log(probability / weights[candidate])
         counts[candidate] += 1
         drawn += 1
-    for i in range(theta.shape[0]):
-        if switched[i]:
-            counts[theta[i]] -= 1
+    count_draws(counts, theta, switched, -1)
     return ratio
 
 
@@ -614,13 +598,10 @@ def _relocate(model, state, chosen, generator):  # type: ignore[no-untyped-def]
             end,
             generator,
         )
-        for t in range(first, end):
-            if state.switched[t]:
-                state.counts[state.subgoal_of[t]] -= 1
-            state.subgoal_of[t] = candidates[path[t - first]]
-            state.switched[t] = switched[t - first]
-            if state.switched[t]:
-                state.counts[state.subgoal_of[t]] += 1
+        state.subgoal_of[first:end] = candidates[path]
+        state.switched[first:end] = switched
+    state.counts[:] = 0
+    count_draws(state.counts, state.subgoal_of, state.switched, 1)
 
 
 @njit(nogil=True, cache=True)
@@ -683,11 +664,9 @@ def _draw_groups(model, state, chosen, generator):  # type: ignore[no-untyped-de
     for group in range(groups):
         weights = np.exp(scores[group] - scores[group].max())
         subgoal[group] = categorical(weights, weights.sum(), generator)
+    state.subgoal_of[:] = subgoal[state.partition_of]
     state.counts[:] = 0
-    for t in range(state.subgoal_of.shape[0]):
-        state.subgoal_of[t] = subgoal[state.partition_of[t]]
-        if state.switched[t]:
-            state.counts[state.subgoal_of[t]] += 1
+    count_draws(state.counts, state.subgoal_of, state.switched, 1)
 
 
 @njit(nogil=True, cache=True)

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from numba import njit
 
 from bnirl_ros.inference.draws import Draws
+from bnirl_ros.inference.kernels import count_draws
 from bnirl_ros.inference.mode import Mode
 from bnirl_ros.inference.pursuit_gibbs import (
     ALPHA,
@@ -179,9 +180,7 @@ def _restore(state, subgoal_of, switched):  # type: ignore[no-untyped-def]
     state.subgoal_of[:] = subgoal_of
     state.switched[:] = switched
     state.counts[:] = 0
-    for t in range(switched.shape[0]):
-        if switched[t]:
-            state.counts[subgoal_of[t]] += 1
+    count_draws(state.counts, subgoal_of, switched, 1)
 
 
 @njit(nogil=True, cache=True)
@@ -229,9 +228,7 @@ def _best_block(model, state, likely, first, end, forbidden):  # type: ignore[no
     part = model.state_part[model.state_of[first]]
     # With the block's own draws: an estimate of the weights, where it is most of what there is.
     weights = urn_weights(model, parameters[ETA], counts, part)
-    for t in range(first, last):
-        if state.switched[t]:
-            counts[theta[t]] -= 1
+    count_draws(counts, theta[first:last], state.switched[first:last], -1)
     if forbidden >= 0:
         weights[forbidden] = 0.0
     new_theta, new_switched = _viterbi(model, parameters, likely, weights, theta, first, end, last)
@@ -247,9 +244,7 @@ def _best_block(model, state, likely, first, end, forbidden):  # type: ignore[no
     if forbidden >= 0 or gain > _GAIN:
         theta[first:last] = new_theta
         state.switched[first:last] = new_switched
-    for t in range(first, last):
-        if state.switched[t]:
-            counts[theta[t]] += 1
+    count_draws(counts, theta[first:last], state.switched[first:last], 1)
 
 
 @njit(nogil=True, cache=True)

@@ -128,19 +128,10 @@ def split_trials(demonstration: Demonstration) -> tuple[Demonstration, Demonstra
     A trial is the two episodes 2k and 2k + 1 of its players. These stay together: they may be in
     kitchens without a way from one to the other, and are then never in the same states.
     """
-    return _every_second_trial(demonstration, 0), _every_second_trial(demonstration, 1)
-
-
-def _every_second_trial(demonstration: Demonstration, first: int) -> Demonstration:
-    observed = demonstration.episode // 2 % 2 == first
-    ended = demonstration.last_episode // 2 % 2 == first
-    return Demonstration(
-        episode=demonstration.episode[observed],
-        cells=demonstration.cells[observed],
-        action=demonstration.action[observed],
-        last_episode=demonstration.last_episode[ended],
-        last_cells=demonstration.last_cells[ended],
-    )
+    episodes = np.unique(demonstration.episode)
+    is_odd = episodes // 2 % 2 == 1
+    learnt, held_out = episodes[~is_odd], episodes[is_odd]
+    return demonstration.of_episodes(learnt), demonstration.of_episodes(held_out)
 
 
 @dataclass(frozen=True)
