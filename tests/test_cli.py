@@ -852,6 +852,16 @@ def test_help_tells_every_setting_with_its_default(
     assert bnirl("--version").out == f"bnirl {bnirl_ros.__version__}\n"
 
 
+def test_a_reader_that_has_had_enough_is_no_fault(tmp_path: Path) -> None:
+    process = in_process("infer", PAPER_BAG, "--out", tmp_path, *QUICK)
+    assert process.stdout is not None
+    process.stdout.close()
+    process.stdout = None
+    end = ended(process)
+    assert (end.status, end.err) == (1, "")
+    assert sorted(path.name for path in tmp_path.iterdir()) == FILES
+
+
 # Stopping it
 
 
