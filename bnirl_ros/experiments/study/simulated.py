@@ -90,7 +90,7 @@ def random_map(generator: np.random.Generator) -> GridMap:
             wall = free if generator.random() < 0.5 else free.T
             wall[row, column : column + length] = False
         rooms, _ = label(free)  # neighbours share an edge, so that no diagonal step is blocked
-        room = rooms == np.bincount(rooms[free]).argmax()
+        room = rooms == int(np.argmax(np.bincount(rooms[free])))
         if room.mean() >= _LEAST_FREE:
             return GridMap(room)
 
