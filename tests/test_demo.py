@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from bnirl_ros import cli
+from bnirl_ros.bags.demonstration import read_demonstration
 from bnirl_ros.bags.reader import Bag
 from bnirl_ros.experiments.scenarios import PAPER_LOOP
 from bnirl_ros.resources import share_folder
@@ -46,6 +47,7 @@ def test_demo_tells_shows_and_records_what_it_found(tmp_path: Path) -> None:
     counts = {topic.name: topic.messages for topic in bag.topics()}
     assert min(counts.values()) > 0
     assert {"/map", "/subgoals", "/assignments", "/waypoints", "/subgoal_belief"} < set(counts)
+    assert counts["/action"] == len(read_demonstration(LOOP, {}).recording.actions)
     assert sum(1 for _ in bag.messages()) == sum(counts.values())
     assert bag.damage is None
 

@@ -31,10 +31,12 @@ from bnirl_ros.views.results import subgoals_in
 from bnirl_ros.views.tables import subgoal_table
 
 _RECORDED = {
-    "/map": TOPIC_TYPES["map"],
+    **{f"/{name}": type_name for name, type_name in TOPIC_TYPES.items()},
     **{f"/{name}": type_name for name, type_name in OUTPUTS.items()},
     "/diagnostics": DiagnosticArray.TYPE,
 }
+_PASSING = ("/pose", "/action", "/diagnostics")  # the others are latched
+_DEPTH = 40_000  # [messages] that may wait to be recorded: as many as the node lets wait
 HUMAN_BAG = "overcooked_random3"
 """The bag that is replayed unless another one is named: 16 episodes of people at play."""
 
@@ -43,21 +45,21 @@ _END_PATIENCE = 20.0  # [s] for a node to end
 
 
 class _Watcher(Node):
-    """Records what the node publishes, and remembers its last word on how it is."""
+    """Records what the node takes in and publishes, and remembers its last word on how it is."""
 
     def __init__(self, bag: BagWriter) -> None:
         super().__init__("demo")
         self.diagnostics: dict[str, str] = {}
         self.infer = self.create_client(Trigger, "/subgoal_node/infer")
         for topic, type_name in _RECORDED.items():
-            latched = topic != "/diagnostics"
+            latched = topic not in _PASSING
             durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
             bag.add_topic(topic, type_name, LATCHED if latched else QosProfile())
             self.create_subscription(
                 message_class(type_name),
                 topic,
                 self._recorder(bag, topic),
-                QoSProfile(depth=100, durability=durability),
+                QoSProfile(depth=_DEPTH, durability=durability),
                 raw=True,
             )
 
@@ -110,7 +112,8 @@ def demo(bag: Path, out: Path) -> None:
         tell = stack.enter_context(_teller())
         parameters = ["--ros-args", "-p", f"result_folder:={out.resolve()}"]
         node = stack.enter_context(_process("subgoal_node", parameters))
-        replay = stack.enter_context(_process("replay_node", [str(bag), "--fast"]))
+        both = ["--subscribers", "2"]  # the node, and the watcher
+        replay = stack.enter_context(_process("replay_node", [str(bag), "--fast", *both]))
 
         def replayed() -> bool:
             _check(node, "subgoal_node", may_end=False)

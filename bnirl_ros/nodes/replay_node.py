@@ -19,7 +19,7 @@ from rclpy.utilities import remove_ros_args
 from bnirl_ros.bags.qos import LATCHED, QosProfile
 from bnirl_ros.bags.reader import Bag, RawMessage, Topic
 from bnirl_ros.errors import InputError
-from bnirl_ros.inference.settings import above_zero
+from bnirl_ros.inference.settings import above_zero, one_or_more
 from bnirl_ros.maps import load_map
 from bnirl_ros.nodes.conversion import message_class, to_ros
 from bnirl_ros.nodes.process import run
@@ -44,12 +44,14 @@ class Options:
         bag: rosbag2 folder or MCAP file.
         rate: factor on the recorded pace, above 0; None: as fast as subscribers acknowledge.
         grid_map: a map file to publish on /map first, for a bag that has none; None: none.
-        patience: how long to wait for a subscriber of every topic [s].
+        subscribers: how many subscribers of every topic to wait for.
+        patience: how long to wait for them [s].
     """
 
     bag: Path
     rate: float | None
     grid_map: Path | None
+    subscribers: int
     patience: float
 
 
@@ -72,21 +74,24 @@ class ReplayNode(Node):
         for topic in bag.topics():
             self._announce(topic)
 
-    def wait_for_subscribers(self, patience: float) -> None:
-        """Wait until every topic has a subscriber, and a moment more for those still coming.
+    def wait_for_subscribers(self, count: int, patience: float) -> None:
+        """Wait until every topic has so many subscribers, and a moment for those still coming.
 
         Says for whom it waits, and goes on without them when patience is at its end.
         """
         deadline = time.monotonic() + patience
         tell_at = time.monotonic() + 1.0
-        while missing := self._without_subscriber():
+        wanted = "subscriber" if count == 1 else f"{count} subscribers"
+        while missing := self._with_fewer_subscribers(count):
             if time.monotonic() > deadline:
                 self.get_logger().warning(
-                    f"no subscriber of {', '.join(missing)} after {patience:g} s; goes on without"
+                    f"no {wanted} of {', '.join(missing)} after {patience:g} s; goes on without"
                 )
                 return
             if time.monotonic() > tell_at:
-                self.get_logger().info(f"waits for a subscriber of {', '.join(missing)}")
+                self.get_logger().info(
+                    f"waits for {'a ' * (count == 1)}{wanted} of {', '.join(missing)}"
+                )
                 tell_at = deadline
             time.sleep(_LOOK_PERIOD)
         # A recorder beside the first subscriber is found a little later, and a short replay would
@@ -185,8 +190,8 @@ class ReplayNode(Node):
             for topic, publisher in self._topic_publishers.items()
         }
 
-    def _without_subscriber(self) -> list[str]:
-        return [topic for topic, count in self._subscriber_counts().items() if count == 0]
+    def _with_fewer_subscribers(self, wanted: int) -> list[str]:
+        return [topic for topic, count in self._subscriber_counts().items() if count < wanted]
 
 
 def qos_profile(recorded: QosProfile) -> QoSProfile:
@@ -221,7 +226,7 @@ def replay(options: Options) -> None:
             node.publish_map(options.grid_map)
         for topic, why in node.skipped.items():
             log.warning(f"{topic} is not sent: {why}")
-        node.wait_for_subscribers(options.patience)
+        node.wait_for_subscribers(options.subscribers, options.patience)
         node.play(bag)
         if bag.damage:
             raise InputError(bag.damage)
@@ -251,11 +256,19 @@ def parse(arguments: Sequence[str], name: str = "replay_node") -> Options:
         type=above_zero,
         default=10.0,
         metavar="SECONDS",
-        help="how long to wait for a subscriber of every topic (%(default)s)",
+        help="how long to wait for the subscribers (%(default)s)",
     )
-
+    parser.add_argument(
+        "--subscribers",
+        type=one_or_more,
+        default=1,
+        metavar="N",
+        help="how many subscribers of every topic to wait for, such as 2 for a node and a "
+        "recorder (%(default)s)",
+    )
     given = parser.parse_args(arguments)
-    return Options(given.bag, None if given.fast else given.rate, given.map, given.wait)
+    rate = None if given.fast else given.rate
+    return Options(given.bag, rate, given.map, given.subscribers, given.wait)
 
 
 def main(arguments: Sequence[str] | None = None, name: str = "replay_node") -> int:
