@@ -8,9 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csr_array
 
+from bnirl_ros.mdp import reward_values
 from bnirl_ros.mdp.actions import ACTION_NAMES, STEPS, action_of_name, action_of_step
 from bnirl_ros.mdp.finite_mdp import FiniteMDP
 from bnirl_ros.mdp.goal_values import goal_values
+from bnirl_ros.mdp.goals import Goals
 from bnirl_ros.mdp.grid_world import GridWorld
 from reference import grid_transitions, optimal_values
 
@@ -44,6 +46,65 @@ def test_three_ways_to_the_values_of_goals_agree(world: GridWorld) -> None:
     on_mdp = goal_values(FiniteMDP.from_transitions(transitions, world.discount), goals, states)
     np.testing.assert_allclose(on_grid[world.free.reshape(-1)], plain[goals], rtol=0, atol=2e-8)
     np.testing.assert_allclose(on_mdp, plain, rtol=0, atol=2e-8)
+
+
+@settings(max_examples=40)
+@given(grid_worlds(), st.data())
+def test_values_of_any_rewards_and_of_sets_of_goals_agree_with_plain_ones(
+    world: GridWorld, data: st.DataObject
+) -> None:
+    steps = [(int(dx), int(dy)) for dx, dy in STEPS[world.actions]]
+    transitions = grid_transitions(world.free, steps, world.success)
+    free = np.flatnonzero(world.free)
+    drawn = data.draw(
+        st.lists(st.floats(-3.0, 3.0), min_size=2 * len(free), max_size=2 * len(free))
+    )
+    rewards = np.zeros((world.state_count, 2))
+    rewards[free] = np.reshape(drawn, (-1, 2))
+    subsets = st.lists(st.sampled_from(free.tolist()), min_size=1, unique=True)
+    goals = Goals.of_sets(data.draw(st.lists(subsets, min_size=1, max_size=3)))
+    rewards = np.column_stack([rewards, goals.rewards(range(len(goals)), world.state_count)])
+    plain = np.stack(
+        [optimal_values(transitions, reward, world.discount) for reward in rewards.T], axis=-1
+    )
+    for mdp in (world, FiniteMDP.from_transitions(transitions, world.discount)):
+        values = reward_values.optimal_values(mdp, rewards)
+        of_actions = reward_values.action_values(mdp, rewards, values, free)
+        np.testing.assert_allclose(of_actions, plain[free], rtol=0, atol=2e-8)
+        np.testing.assert_allclose(
+            goal_values(mdp, goals, free), plain[free][..., 2:], rtol=0, atol=2e-8
+        )
+        again = reward_values.optimal_values(mdp, rewards, start=values + 1e-3)
+        np.testing.assert_allclose(again[free], values[free], rtol=0, atol=2e-8)
+
+
+def test_a_goal_of_one_state_is_that_state() -> None:
+    world = GridWorld(np.ones((5, 6), dtype=bool))
+    states = np.arange(30)
+    np.testing.assert_array_equal(
+        goal_values(world, Goals.of_sets([[7], [29]]), states), goal_values(world, [7, 29], states)
+    )
+
+
+def test_goals_of_several_states_keep_their_places_among_single_ones() -> None:
+    world = GridWorld(np.ones((4, 4), dtype=bool))
+    sets = [[3], [0, 1, 4], [9], [15, 14]]
+    together = goal_values(world, Goals.of_sets(sets), [2, 5])
+    apart = [goal_values(world, Goals.of_sets([states]), [2, 5]) for states in sets]
+    np.testing.assert_allclose(together, np.concatenate(apart, axis=2), atol=2e-8)
+
+
+def test_a_goal_without_states_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least one state"):
+        Goals.of_sets([[1], []])
+
+
+def test_rewards_of_another_number_of_states_are_refused() -> None:
+    world = GridWorld(np.ones((2, 2), dtype=bool))
+    with pytest.raises(ValueError, match=r"must both be \(4, L\)"):
+        reward_values.optimal_values(world, np.zeros((3, 1)))
+    with pytest.raises(ValueError, match=r"must both be \(4, L\)"):
+        reward_values.optimal_values(world, np.zeros((4, 1)), start=np.zeros((4, 2)))
 
 
 def test_grid_world_gives_its_own_transitions() -> None:

@@ -100,6 +100,17 @@ class FiniteMDP:
         """(U, 2) where each state lies: nobody knows, so far away from every other."""
         return np.stack([1000 * states, np.zeros_like(states)], axis=1)
 
+    @property
+    def _motion(self) -> tuple[Any, ...]:
+        """What the kernels take of the process."""
+        return (
+            self.row_starts,
+            self.successors,
+            self.probabilities,
+            self.action_count,
+            self.discount,
+        )
+
     def goal_values_of(
         self,
         goals: npt.NDArray[np.int64],
@@ -107,9 +118,31 @@ class FiniteMDP:
         tolerance: float,
     ) -> npt.NDArray[np.float64]:
         """Q*(s, a, R_g) of a few goals at once; see `bnirl_ros.mdp.goal_values.goal_values`."""
-        motion = (self.row_starts, self.successors, self.probabilities, self.action_count)
-        first_passage = _first_passage(*motion, self.discount, goals, tolerance)
-        return _action_values(*motion, self.discount, goals, states, first_passage)
+        first_passage = np.zeros((self.state_count, len(goals)))
+        first_passage[goals, np.arange(len(goals))] = 1.0
+        rewards = np.zeros((1, len(goals)))
+        _solve(*self._motion, rewards, goals, tolerance, first_passage)
+        return _goal_action_values(*self._motion, goals, states, first_passage)
+
+    def optimal_values_of(
+        self,
+        rewards: npt.NDArray[np.float64],
+        start: npt.NDArray[np.float64],
+        tolerance: float,
+    ) -> npt.NDArray[np.float64]:
+        """V*(s, R) (S, L); see `bnirl_ros.mdp.reward_values.optimal_values`."""
+        values = start.copy()
+        _solve(*self._motion, rewards, np.full(rewards.shape[1], -1), tolerance, values)
+        return values
+
+    def action_values_of(
+        self,
+        rewards: npt.NDArray[np.float64],
+        values: npt.NDArray[np.float64],
+        states: npt.NDArray[np.int64],
+    ) -> npt.NDArray[np.float64]:
+        """Q(s, a, R) (U, A, L); see `bnirl_ros.mdp.reward_values.action_values`."""
+        return _action_values(*self._motion, rewards, values, states)
 
 
 _Coordinates = tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any], tuple[int, int]]
@@ -160,23 +193,31 @@ def _expected(row_starts, successors, probabilities, row, values, lane):  # type
 
 
 @njit(nogil=True, cache=True)
-def _first_passage(  # type: ignore[no-untyped-def]
-    row_starts, successors, probabilities, action_count, discount, goals, tolerance
+def _solve(  # type: ignore[no-untyped-def]
+    row_starts,
+    successors,
+    probabilities,
+    action_count,
+    discount,
+    rewards,
+    goals,
+    tolerance,
+    values,
 ):
     """As the grid world's: Gauss-Seidel value iteration, the states forth and back in turn."""
     state_count = (row_starts.shape[0] - 1) // action_count
     lanes = goals.shape[0]
-    values = np.zeros((state_count, lanes))
-    for lane in range(lanes):
-        values[goals[lane], lane] = 1.0
+    same_reward = rewards.shape[0] == 1
     mean = np.empty(lanes)
     best = np.empty(lanes)
     sweep = 0
-    largest_change = np.inf
-    while largest_change * discount > max(tolerance * (1.0 - discount), 4e-16):
+    finest = 4e-16 * max(1.0, np.abs(rewards).max() / (1.0 - discount))
+    largest_change = 0.0
+    while sweep == 0 or largest_change * discount > max(tolerance * (1.0 - discount), finest):
         largest_change = 0.0
         for step in range(state_count):
             state = step if sweep & 1 == 0 else state_count - 1 - step
+            reward = rewards[0 if same_reward else state]
             best[:] = -np.inf
             for action in range(action_count):
                 row = action * state_count + state
@@ -188,15 +229,31 @@ def _first_passage(  # type: ignore[no-untyped-def]
                     best[lane] = max(best[lane], mean[lane])
             for lane in range(lanes):
                 if state != goals[lane]:
-                    change = discount * best[lane] - values[state, lane]
-                    largest_change = max(largest_change, abs(change))
-                    values[state, lane] = discount * best[lane]
+                    value = reward[lane] + discount * best[lane]
+                    largest_change = max(largest_change, abs(value - values[state, lane]))
+                    values[state, lane] = value
         sweep += 1
-    return values
 
 
 @njit(nogil=True, cache=True)
 def _action_values(  # type: ignore[no-untyped-def]
+    row_starts, successors, probabilities, action_count, discount, rewards, values, states
+):
+    """Q (U, A, L) at `states`: R(s) + gamma E[V(s')]."""
+    state_count = (row_starts.shape[0] - 1) // action_count
+    rows = (row_starts, successors, probabilities)
+    result = np.empty((states.shape[0], action_count, values.shape[1]))
+    for lane in range(values.shape[1]):
+        for index in range(states.shape[0]):
+            state = states[index]
+            for action in range(action_count):
+                mean = _expected(*rows, action * state_count + state, values, lane)
+                result[index, action, lane] = rewards[state, lane] + discount * mean
+    return result
+
+
+@njit(nogil=True, cache=True)
+def _goal_action_values(  # type: ignore[no-untyped-def]
     row_starts,
     successors,
     probabilities,

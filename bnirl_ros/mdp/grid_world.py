@@ -134,6 +134,12 @@ class GridWorld:
             layers.append(csr_array(entries, shape=(state_count, state_count)))
         return layers
 
+    @property
+    def _motion(self) -> tuple[Any, ...]:
+        """What the kernels take of the world."""
+        spread = (1.0 - self.success) / (len(self.offsets) - 1)
+        return self.open_moves, self.offsets, self.success, spread, self.discount
+
     def goal_values_of(
         self,
         goals: npt.NDArray[np.int64],
@@ -141,34 +147,59 @@ class GridWorld:
         tolerance: float,
     ) -> npt.NDArray[np.float64]:
         """Q*(s, a, R_g) of a few goals at once; see `bnirl_ros.mdp.goal_values.goal_values`."""
-        spread = (1.0 - self.success) / (len(self.offsets) - 1)
-        motion = (self.open_moves, self.offsets, self.success, spread, self.discount)
-        first_passage = _first_passage(*motion, goals, tolerance)
-        return _action_values(*motion, goals, states, first_passage)
+        first_passage = np.zeros((self.state_count, len(goals)))
+        first_passage[goals, np.arange(len(goals))] = 1.0
+        rewards = np.zeros((1, len(goals)))
+        _solve(*self._motion, rewards, goals, tolerance, first_passage)
+        return _goal_action_values(*self._motion, goals, states, first_passage)
+
+    def optimal_values_of(
+        self,
+        rewards: npt.NDArray[np.float64],
+        start: npt.NDArray[np.float64],
+        tolerance: float,
+    ) -> npt.NDArray[np.float64]:
+        """V*(s, R) (S, L); see `bnirl_ros.mdp.reward_values.optimal_values`."""
+        values = np.where(self.free.reshape(-1, 1), start, 0.0)
+        no_goal = np.full(rewards.shape[1], -1)
+        _solve(*self._motion, rewards, no_goal, tolerance, values)
+        return values
+
+    def action_values_of(
+        self,
+        rewards: npt.NDArray[np.float64],
+        values: npt.NDArray[np.float64],
+        states: npt.NDArray[np.int64],
+    ) -> npt.NDArray[np.float64]:
+        """Q(s, a, R) (U, A, L); see `bnirl_ros.mdp.reward_values.action_values`."""
+        return _action_values(*self._motion, rewards, values, states)
 
 
 @njit(nogil=True, cache=True)
-def _first_passage(open_moves, offsets, success, spread, discount, goals, tolerance):  # type: ignore[no-untyped-def]
-    """Discounted first-passage values h (S, G): h_g(g) = 1, elsewhere gamma max_a E[h_g(s')].
+def _solve(open_moves, offsets, success, spread, discount, rewards, goals, tolerance, values):  # type: ignore[no-untyped-def]
+    """Values (S, L) of V(s) = R(s) + gamma max_a E[V(s')], but for V(goals[l]), which is kept.
 
-    Gauss-Seidel value iteration from below, all goals in the lanes of the innermost loop, the
-    cells in four alternating orders so that the wave from a goal is carried along whichever way
-    it runs. A sweep is a contraction by gamma, so a largest change d leaves an error of at most
-    d gamma / (1 - gamma). Ends when that is within `tolerance`, or where float64 resolves no more.
+    With a goal, no reward and V(goal) = 1 they are the discounted first-passage values h of the
+    goal. Without any (-1) they are V*.
 
-    The mean over the outcomes n_b of action a is (success - spread) n_a + spread sum_b n_b.
+    Gauss-Seidel value iteration, all lanes in the innermost loop, the cells in four alternating
+    orders so that a wave is carried along whichever way it runs. A sweep is a contraction by
+    gamma, so a largest change d leaves an error of at most d gamma / (1 - gamma). Ends when that
+    is within `tolerance`, or where float64 resolves no more.
+
+    The mean over the outcomes n_b of action a is (success - spread) n_a + spread sum_b n_b. Rows
+    of `rewards`: one for each state, or a single one for all.
     """
     height, width = open_moves.shape
     lanes = goals.shape[0]
     advantage = success - spread
-    values = np.zeros((height * width, lanes))
-    for lane in range(lanes):
-        values[goals[lane], lane] = 1.0
+    same_reward = rewards.shape[0] == 1
     total = np.empty(lanes)
     best = np.empty(lanes)
     sweep = 0
-    largest_change = np.inf
-    while largest_change * discount > max(tolerance * (1.0 - discount), 4e-16):
+    finest = 4e-16 * max(1.0, np.abs(rewards).max() / (1.0 - discount))
+    largest_change = 0.0
+    while sweep == 0 or largest_change * discount > max(tolerance * (1.0 - discount), finest):
         largest_change = 0.0
         for row in range(height):
             y = row if sweep & 2 == 0 else height - 1 - row
@@ -178,6 +209,7 @@ def _first_passage(open_moves, offsets, success, spread, discount, goals, tolera
                 if bits == 0:  # a blocked cell; in a free one, staying is always open
                     continue
                 state = y * width + x
+                reward = rewards[0 if same_reward else state]
                 total[:] = 0.0
                 best[:] = -np.inf
                 for action in range(offsets.shape[0]):
@@ -188,11 +220,10 @@ def _first_passage(open_moves, offsets, success, spread, discount, goals, tolera
                         best[lane] = max(best[lane], advantage * value)
                 for lane in range(lanes):
                     if state != goals[lane]:
-                        value = discount * (best[lane] + spread * total[lane])
+                        value = reward[lane] + discount * (best[lane] + spread * total[lane])
                         largest_change = max(largest_change, abs(value - values[state, lane]))
                         values[state, lane] = value
         sweep += 1
-    return values
 
 
 @njit(nogil=True, cache=True)
@@ -208,7 +239,25 @@ def _expected(values, lane, state, bits, offsets, success, spread, expected):  #
 
 
 @njit(nogil=True, cache=True)
-def _action_values(open_moves, offsets, success, spread, discount, goals, states, first_passage):  # type: ignore[no-untyped-def]
+def _action_values(open_moves, offsets, success, spread, discount, rewards, values, states):  # type: ignore[no-untyped-def]
+    """Q (U, A, L) at `states`: R(s) + gamma E[V(s')]."""
+    bits = open_moves.reshape(-1)
+    action_count = offsets.shape[0]
+    result = np.empty((states.shape[0], action_count, values.shape[1]))
+    expected = np.empty(action_count)
+    for lane in range(values.shape[1]):
+        for index in range(states.shape[0]):
+            state = states[index]
+            _expected(values, lane, state, bits[state], offsets, success, spread, expected)
+            for action in range(action_count):
+                result[index, action, lane] = rewards[state, lane] + discount * expected[action]
+    return result
+
+
+@njit(nogil=True, cache=True)
+def _goal_action_values(  # type: ignore[no-untyped-def]
+    open_moves, offsets, success, spread, discount, goals, states, first_passage
+):
     """Q* (U, A, G) at `states`: V_g = h_g V_g(g), V_g(g) = 1 + gamma V_g(g) max_a E[h_g]."""
     bits = open_moves.reshape(-1)
     action_count = offsets.shape[0]

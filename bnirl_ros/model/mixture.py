@@ -8,7 +8,8 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from bnirl_ros.mdp.goal_values import MarkovDecisionProcess, goal_values
+from bnirl_ros.mdp.goal_values import goal_values
+from bnirl_ros.mdp.process import MarkovDecisionProcess
 from bnirl_ros.model.likelihood import action_log_likelihood
 
 

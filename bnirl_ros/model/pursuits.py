@@ -19,7 +19,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from bnirl_ros.mdp.goal_values import MarkovDecisionProcess, goal_values
+from bnirl_ros.mdp.goal_values import goal_values
+from bnirl_ros.mdp.process import MarkovDecisionProcess
 from bnirl_ros.model.likelihood import delays, value_losses
 
 _VALUE_TOLERANCE = 1e-13  # delays are ratios of values, which fall off with the distance
