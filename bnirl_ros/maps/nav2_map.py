@@ -5,9 +5,6 @@ The rules follow nav2_map_server/src/map_io.cpp of ros-navigation/navigation2.
 
 from __future__ import annotations
 
-import math
-import struct
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +15,8 @@ import numpy.typing as npt
 
 from bnirl_ros.errors import InputError
 from bnirl_ros.maps.grid_map import GridMap
-from bnirl_ros.maps.occupancy import FREE, OCCUPIED, check_geometry, map_from_occupancy
+from bnirl_ros.maps.map_file import image_path_of, number_of, origin_of, read_image, read_keys
+from bnirl_ros.maps.occupancy import FREE, OCCUPIED, map_from_occupancy
 
 UNKNOWN = -1
 """Occupancy of a cell about which the image says nothing."""
@@ -65,7 +63,7 @@ def read_nav2_map(yaml_path: str | Path) -> GridMap:
     """
     path = Path(yaml_path)
     settings = _read_settings(path)
-    pixels = _read_pixels(settings, path)
+    pixels = read_image(settings.image, settings.resolution, settings.origin, path, _pixels_of)
     height, width = pixels.channels.shape[:2]
     return map_from_occupancy(
         _occupancy_of(pixels, settings)[::-1],
@@ -79,70 +77,20 @@ def read_nav2_map(yaml_path: str | Path) -> GridMap:
 
 
 def _read_settings(path: Path) -> _MapFile:
-    import yaml
-
-    try:
-        content = yaml.safe_load(path.read_bytes())
-    except OSError as error:
-        raise InputError(
-            f"{path}: the map file cannot be read ({error.strerror}); check the path"
-        ) from None
-    # PyYAML lets ValueError through for impossible dates, RecursionError for deep nesting.
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        mark = getattr(error, "problem_mark", None)
-        place = f" at line {mark.line + 1}, column {mark.column + 1}" if mark else ""
-        raise InputError(
-            f"{path}: this is not valid YAML{place}; name the .yaml file that map_saver wrote"
-        ) from None
-    if not isinstance(content, Mapping):
-        raise InputError(
-            f"{path}: this YAML holds no keys; a Nav2 map has image, resolution, origin, negate,"
-            " occupied_thresh and free_thresh"
-        )
+    content = read_keys(
+        path,
+        "name the .yaml file that map_saver wrote",
+        "a Nav2 map has image, resolution, origin, negate, occupied_thresh and free_thresh",
+    )
     return _MapFile(
-        image=_image_path(content, path),
-        resolution=_number(content, "resolution", path),
-        origin=_origin(content, path),
-        negate=bool(_number(content, "negate", path)),
-        occupied_thresh=_number(content, "occupied_thresh", path),
-        free_thresh=_number(content, "free_thresh", path),
+        image=image_path_of(content, path),
+        resolution=number_of(content, "resolution", path),
+        origin=origin_of(content, path),
+        negate=bool(number_of(content, "negate", path)),
+        occupied_thresh=number_of(content, "occupied_thresh", path),
+        free_thresh=number_of(content, "free_thresh", path),
         mode=_mode(content, path),
     )
-
-
-def _value(content: Mapping[str, Any], key: str, path: Path) -> Any:
-    if key not in content:
-        raise InputError(f"{path}: the key '{key}' is missing; add it as map_saver writes it")
-    return content[key]
-
-
-def _as_number(value: Any) -> float:
-    """The finite number that a YAML value is, or NaN."""
-    try:
-        # YAML 1.1 reads 5e-2 as text; Nav2 reads it as a number.
-        number = float(value)
-    except (TypeError, ValueError, OverflowError):
-        return math.nan
-    return number if math.isfinite(number) else math.nan
-
-
-def _number(content: Mapping[str, Any], key: str, path: Path) -> float:
-    value = _value(content, key, path)
-    number = _as_number(value)
-    if math.isnan(number):
-        raise InputError(f"{path}: '{key}' is {value!r}; it must be a finite number")
-    return number
-
-
-def _origin(content: Mapping[str, Any], path: Path) -> tuple[float, float, float]:
-    value = _value(content, "origin", path)
-    numbers = [_as_number(item) for item in value] if isinstance(value, list) else []
-    if len(numbers) != 3 or any(math.isnan(number) for number in numbers):
-        raise InputError(
-            f"{path}: 'origin' is {value!r}; it must be three finite numbers, [x, y, yaw]"
-        )
-    x, y, yaw = numbers
-    return x, y, yaw
 
 
 def _mode(content: Mapping[str, Any], path: Path) -> str:
@@ -151,42 +99,6 @@ def _mode(content: Mapping[str, Any], path: Path) -> str:
     if mode not in _MODES:
         raise InputError(f"{path}: 'mode' is {value!r}; it must be one of {', '.join(_MODES)}")
     return mode
-
-
-def _image_path(content: Mapping[str, Any], path: Path) -> Path:
-    value = _value(content, "image", path)
-    if not isinstance(value, str) or not value:
-        raise InputError(f"{path}: 'image' is {value!r}; it must be the path of an image")
-    return path.parent / value
-
-
-def _read_pixels(settings: _MapFile, path: Path) -> _Pixels:
-    from PIL import Image
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            # Only these: Pillow would run an interpreter for some other formats.
-            with Image.open(settings.image, formats=("PPM", "PNG", "BMP")) as image:
-                check_geometry(
-                    image.width, image.height, settings.resolution, settings.origin, str(path)
-                )
-                return _pixels_of(image)
-    except InputError:
-        raise
-    except FileNotFoundError:
-        raise InputError(
-            f"{path}: there is no image at {settings.image}; put it there or correct 'image'"
-        ) from None
-    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
-        raise InputError(
-            f"{path}: the image {settings.image} is too large; crop it or lower its resolution"
-        ) from None
-    # All of these are ways in which Pillow says that an image is broken.
-    except (OSError, SyntaxError, ValueError, EOFError, IndexError, struct.error):
-        raise InputError(
-            f"{path}: the image {settings.image} cannot be read; save it again as PGM, PNG or BMP"
-        ) from None
 
 
 def _pixels_of(image: Any) -> _Pixels:
