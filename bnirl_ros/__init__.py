@@ -17,36 +17,42 @@ if TYPE_CHECKING:
     from bnirl_ros.inference.posterior import infer
     from bnirl_ros.inference.settings import Settings
     from bnirl_ros.inference.summary import summarise
-    from bnirl_ros.maps import GridMap, load_map
+    from bnirl_ros.maps import FeatureMap, GridMap, load_features, load_map, with_features
 
 __version__ = "0.1.0"
 
 __all__ = [
     "Demonstration",
+    "FeatureMap",
     "GridMap",
     "InputError",
     "Settings",
     "SubgoalFilter",
     "infer",
+    "load_features",
     "load_map",
     "place",
     "read_csv",
     "read_demonstration",
     "summarise",
+    "with_features",
 ]
 
 _MODULE_OF = {
     "Demonstration": "demonstrations.demonstration",
+    "FeatureMap": "maps",
     "GridMap": "maps",
     "InputError": "errors",
     "Settings": "inference.settings",
     "SubgoalFilter": "inference.filtering",
     "infer": "inference.posterior",
+    "load_features": "maps",
     "load_map": "maps",
     "place": "demonstrations.placement",
     "read_csv": "demonstrations.csv_file",
     "read_demonstration": "bags.demonstration",
     "summarise": "inference.summary",
+    "with_features": "maps",
 }
 
 

@@ -65,6 +65,12 @@ def _parser() -> argparse.ArgumentParser:
         "--map", type=Path, help="Nav2 map .yaml or text grid .txt; wins over a map in the bag"
     )
     infer.add_argument(
+        "--features",
+        type=Path,
+        help="labels (Nav2-style .yaml, .txt) or places (.yaml) of the map's cells: infer feature "
+        "subgoals",
+    )
+    infer.add_argument(
         "--out", type=Path, default=Path("bnirl_out"), help="folder for the results (%(default)s)"
     )
     infer.add_argument(
@@ -189,17 +195,19 @@ def _read(
     options: argparse.Namespace, settings: Settings, remappings: Mapping[str, str]
 ) -> tuple[Demonstration, GridMap, str | None]:
     """The demonstration, its map, and a sentence on damage to the file, if there is any."""
-    from bnirl_ros.maps import load_map
+    from bnirl_ros.maps import load_features, load_map, with_features
 
     path: Path = options.demonstration
     command: argparse.ArgumentParser = options.command
     given_map = load_map(options.map) if options.map else None
+    features = load_features(options.features) if options.features else None
     if path.suffix.lower() == ".csv":
         from bnirl_ros.demonstrations.csv_file import read_csv
 
         if given_map is None:
             command.error(f"{path}: a CSV file tells no map; give one with --map")
-        return read_csv(path, given_map, settings.moves), given_map, None
+        demonstration = read_csv(path, given_map, settings.moves)
+        return demonstration, with_features(given_map, features) if features else given_map, None
 
     from bnirl_ros.bags.demonstration import read_demonstration
     from bnirl_ros.demonstrations.placement import place
@@ -219,6 +227,8 @@ def _read(
             f"{path}: {recorded.damage or 'no pose and action of equal stamps lie on the map'}; "
             "check its topics, their frame and the map"
         )
+    if features:
+        grid_map = with_features(grid_map, features)
     return placement.demonstration, grid_map, recorded.damage
 
 

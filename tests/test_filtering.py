@@ -200,7 +200,7 @@ def test_observing_step_by_step_is_filtering_the_whole() -> None:
     model = pursuit_model_of(watched, posterior.candidates, MAP, posterior.settings)
     belief, _ = filtered(model, weights, posterior.draws.parameters[0, 0])
     watching = SubgoalFilter(posterior, MAP)
-    np.testing.assert_array_equal(watching.candidates, posterior.candidates)
+    assert watching.candidates is posterior.candidates
     for row, starts in enumerate(watched.starts):
         if starts:
             watching.begin_episode()
@@ -229,7 +229,9 @@ def test_what_is_told_can_be_changed_without_changing_the_belief() -> None:
 def test_the_belief_comes_to_rest_on_the_true_subgoal(seed: int) -> None:
     posterior = posterior_with(chains=2, sweeps=300, burn_in=100)
     watched, pursued = walked(seed, episodes=1)
-    number_of = {tuple(cell): index for index, cell in enumerate(posterior.candidates.tolist())}
+    number_of = {
+        tuple(cell): index for index, cell in enumerate(posterior.candidates.coordinates.tolist())
+    }
     true = np.array([number_of[cell] for cell in ROUND])[pursued]
     watching = SubgoalFilter(posterior, MAP)
     belief = np.array(

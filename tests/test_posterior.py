@@ -21,6 +21,8 @@ from bnirl_ros.inference.summary import episode_visits, summarise
 from bnirl_ros.maps.grid_map import GridMap
 from bnirl_ros.mdp.actions import STEPS
 from bnirl_ros.mdp.finite_mdp import FiniteMDP
+from bnirl_ros.mdp.goals import Goals
+from bnirl_ros.model.candidates import Candidates
 from bnirl_ros.model.mixture import SubgoalMixture, subgoal_mixture
 from bnirl_ros.model.pursuits import PRIORS, PursuitModel, pursuit_model
 from reference import set_partitions
@@ -138,7 +140,7 @@ def test_last_poses_are_candidates_and_free_cells_on_request() -> None:
     demonstration = walk((0, 0), (3, 0), episodes=1)
     moved_on = replace(demonstration, last_cells=np.array([[4, 1]]))
     candidates, _ = model_of(moved_on, MAP, Settings())
-    assert candidates.tolist() == [[0, 0], [1, 0], [2, 0], [3, 0], [4, 1]]
+    assert candidates.coordinates.tolist() == [[0, 0], [1, 0], [2, 0], [3, 0], [4, 1]]
     candidates, _ = model_of(moved_on, MAP, Settings(candidates="free"))
     assert len(candidates) == 49
 
@@ -229,7 +231,7 @@ def test_the_samplers_take_any_finite_mdp() -> None:
     mdp = FiniteMDP.from_transitions(world.transitions(), world.discount)
     candidates, on_grid = model_of(ROUND, MAP, PAPER)
     assert isinstance(on_grid, SubgoalMixture)
-    states, goals = world.states_of(ROUND.cells), world.states_of(candidates)
+    states, goals = world.states_of(ROUND.cells), candidates.goals
     mixture = subgoal_mixture(mdp, states, ROUND.action, goals, alpha=50.0, eta=1.0)
     np.testing.assert_allclose(mixture.log_likelihood, on_grid.log_likelihood, atol=1e-5)
     np.testing.assert_array_equal(mixture.pair_of, on_grid.pair_of)
@@ -300,7 +302,9 @@ def visits_of(path: list[tuple[int, int]], pursued: list[int], last: bool) -> li
         np.zeros(int(last), dtype=np.int64),
         np.array(path[count:]).reshape(-1, 2),
     )
-    return episode_visits(demonstration, np.array([[2, 0], [0, 0]]), np.array(pursued))
+    cells = np.array([[2, 0], [0, 0]])
+    found = Candidates(cells, Goals.of_states(cells[:, 0]), cells)
+    return episode_visits(demonstration, found, np.array(pursued))
 
 
 def test_a_visit_is_an_arrival_at_what_was_pursued() -> None:

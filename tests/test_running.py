@@ -17,7 +17,7 @@ from bnirl_ros.inference.background import BackgroundInference, Result
 from bnirl_ros.inference.posterior import infer
 from bnirl_ros.inference.running import CAPACITY, RunningPosterior
 from bnirl_ros.inference.settings import Settings
-from bnirl_ros.maps.grid_map import GridMap
+from bnirl_ros.maps.grid_map import FeatureMap, GridMap
 
 MAP = GridMap(np.ones((7, 7), dtype=bool))
 SETTINGS = Settings(sweeps=600, burn_in=200)
@@ -105,7 +105,7 @@ def test_pursuits_go_on_in_the_chains() -> None:
     before = finished(RunningPosterior(placed(1), MAP, SETTINGS))
     after = RunningPosterior(placed(2), MAP, SETTINGS, before)
     count = len(before.placement.poses)
-    cells_before, cells_after = before._candidates, after._candidates
+    cells_before, cells_after = before._candidates.coordinates, after._candidates.coordinates
     for old, new in zip(before._states, after._states, strict=True):
         np.testing.assert_array_equal(
             cells_before[old.subgoal_of], cells_after[new.subgoal_of[:count]]
@@ -125,9 +125,27 @@ def test_a_map_that_moves_keeps_subgoals_where_they_are(model: str) -> None:
     before = finished(RunningPosterior(place(recording, MAP), MAP, settings))
     after = RunningPosterior(place(recording, moved), moved, settings, before)
     after.advance(1)
-    assert subgoals_of(after._candidates, after.posterior().mode.subgoal_of) == {
+    assert subgoals_of(after._candidates.coordinates, after.posterior().mode.subgoal_of) == {
         (x + 2, y + 1) for x, y in CORNERS
     }
+
+
+def test_feature_subgoals_go_on_by_their_coordinates() -> None:
+    height, width = MAP.free.shape
+    y, x = np.mgrid[:height, :width]
+    blocks = FeatureMap(np.stack([x // 3, y // 3], axis=2), MAP.free)
+    zones = replace(MAP, features=blocks)
+    before = finished(RunningPosterior(placed(1), zones, SETTINGS))
+    after = RunningPosterior(placed(2), zones, SETTINGS, before)
+    count = len(before.placement.poses)
+    old, new = before._candidates.coordinates, after._candidates.coordinates
+    for was, now in zip(before._states, after._states, strict=True):
+        np.testing.assert_array_equal(old[was.subgoal_of], new[now.subgoal_of[:count]])
+    # A layer that comes or goes leaves nothing to go on from but the parameters.
+    plain = RunningPosterior(placed(2), MAP, SETTINGS, after)
+    plain.advance(1)
+    for was, now in zip(after._states, plain._states, strict=True):
+        assert len(now.counts) == len(plain._candidates) != len(was.counts)
 
 
 def test_memory_is_bounded_and_draws_span_all_sweeps() -> None:

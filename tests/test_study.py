@@ -285,7 +285,7 @@ def test_the_papers_prediction_is_the_urn_over_its_draws() -> None:
     held_out = in_corridor((2, 0, "E"), (2, 1, "W"))
     posterior = infer(learnt, CORRIDOR, settings)
     world = grid_world(CORRIDOR, settings)
-    values = goal_values(world, world.states_of(posterior.candidates), [0, 1])
+    values = goal_values(world, posterior.candidates.goals, [0, 1])
     likelihood = np.exp(action_log_likelihood(values, 1.0))  # (state, action, subgoal)
     expected = np.zeros(2)
     drawn = posterior.draws.subgoal_of.reshape(-1, len(learnt))

@@ -24,7 +24,7 @@ def mode_subgoals(scenario: Scenario, seed: int, settings: Settings) -> set[Cell
     """Subgoals of the posterior mode of the demonstrations that a seed gives."""
     demonstration = demonstrate(scenario, np.random.default_rng(seed))
     posterior = infer(demonstration, scenario.grid_map, settings)
-    cells = posterior.candidates[np.unique(posterior.mode.subgoal_of)]
+    cells = posterior.candidates.coordinates[np.unique(posterior.mode.subgoal_of)]
     return {(int(x), int(y)) for x, y in cells}
 
 

@@ -153,7 +153,7 @@ class SubgoalFilter:
         self._world = grid_world(grid_map, posterior.settings)
         reachable = np.isin(
             self._world.parts_of(np.flatnonzero(self._world.free)),
-            self._world.parts_of(self._world.states_of(self.candidates)),
+            self._world.parts_of(self.candidates.goals.states),
         )
         states = np.flatnonzero(self._world.free)[reachable]
         actions = self._world.actions

@@ -20,7 +20,7 @@ from bnirl_ros.inference.samplers import Model
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.maps.grid_map import GridMap
 from bnirl_ros.mdp.grid_world import GridWorld
-from bnirl_ros.model.candidates import candidate_cells
+from bnirl_ros.model.candidates import Candidates, candidates_of
 from bnirl_ros.model.mixture import SubgoalMixture, subgoal_mixture
 from bnirl_ros.model.pursuits import PursuitModel, pursuit_model
 
@@ -30,7 +30,7 @@ class Posterior:
     """Draws from the posterior of a demonstration's subgoals, and its mode.
 
     Attributes:
-        candidates: (G, 2) int64 cells in the support of P(g).
+        candidates: the G subgoals in the support of P(g).
         demonstration: the N observations.
         draws: draws (chain, draw, N).
         mode: the most probable partition with its subgoals.
@@ -39,7 +39,7 @@ class Posterior:
             free of labels; None where undefined (`bnirl_ros.inference.diagnostics`).
     """
 
-    candidates: npt.NDArray[np.int64]
+    candidates: Candidates
     demonstration: Demonstration
     draws: Draws
     mode: Mode
@@ -84,16 +84,26 @@ def grid_world(grid_map: GridMap, settings: Settings) -> GridWorld:
 
 def model_of(
     demonstration: Demonstration, grid_map: GridMap, settings: Settings
-) -> tuple[npt.NDArray[np.int64], Model]:
-    """Candidate cells (G, 2) and the model over them that the settings ask for."""
+) -> tuple[Candidates, Model]:
+    """The candidates, and the model over them that the settings ask for.
+
+    Raises:
+        InputError: the map has features, but where they are needed it has none.
+    """
     world = grid_world(grid_map, settings)
-    candidates = candidate_cells(settings.candidates, demonstration, world)
+    candidates = candidates_of(
+        settings.candidates,
+        demonstration,
+        world,
+        grid_map.features,
+        by_part=settings.model == "sequential",
+    )
     if settings.model == "paper":
         return candidates, subgoal_mixture(
             world,
             world.states_of(demonstration.cells),
             demonstration.action,
-            world.states_of(candidates),
+            candidates.goals,
             **settings.fixed,
         )
     return candidates, pursuit_model_of(demonstration, candidates, grid_map, settings)
@@ -101,22 +111,33 @@ def model_of(
 
 def pursuit_model_of(
     demonstration: Demonstration,
-    candidates: npt.NDArray[np.int64],
+    candidates: Candidates,
     grid_map: GridMap,
     settings: Settings,
 ) -> PursuitModel:
-    """The sequential model of a demonstration over given candidate cells (G, 2)."""
+    """The sequential model of a demonstration over given candidates.
+
+    Raises:
+        InputError: some of it lies where no candidate can be reached.
+    """
     world = grid_world(grid_map, settings)
     states = world.states_of(demonstration.cells)
-    visited = world.cells_of(np.unique(states))
-    apart = np.linalg.norm(visited[:, None] - candidates, axis=2) * grid_map.resolution
+    visited = np.unique(states)
+    reachable = np.isin(world.parts_of(visited), world.parts_of(candidates.goals.states))
+    if not reachable.all():
+        x, y = world.cells_of(visited[~reachable])[0]
+        raise InputError(
+            f"cell ({x}, {y}): no candidate can be reached from it, though the demonstrator was "
+            "there; give features to more cells, or other candidates"
+        )
+    radius = settings.arrival_radius / grid_map.resolution
     return pursuit_model(
         world,
         states,
         demonstration.action,
         demonstration.starts,
-        world.states_of(candidates),
-        arrived=apart <= settings.arrival_radius,
+        candidates.goals,
+        arrived=candidates.reached_in(world, world.cells_of(visited), radius),
         likelihood=settings.likelihood,
         fixed=settings.fixed,
     )
@@ -130,7 +151,7 @@ def mode_of(model: Model, draws: Draws) -> Mode:
 
 
 def posterior_of(
-    candidates: npt.NDArray[np.int64],
+    candidates: Candidates,
     demonstration: Demonstration,
     model: Model,
     draws: Draws,
@@ -165,13 +186,13 @@ def infer(
 
     Args:
         demonstration: observations on free cells of the map.
-        grid_map: the map.
+        grid_map: the map; with features, subgoals are feature subgoals.
         settings: model and sampling settings.
         progress: told of sweeps as they are done, from several threads.
         stop: set it to give up between sweeps.
 
     Raises:
-        InputError: there is no observation.
+        InputError: there is no observation, or features do not cover what was visited.
         StoppedError: `stop` was set.
     """
     if len(demonstration) == 0:

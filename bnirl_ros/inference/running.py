@@ -115,10 +115,15 @@ class RunningPosterior:
         ]
 
     def _candidates_on(self, before: RunningPosterior) -> npt.NDArray[np.int64]:
-        """(G before,) present index of each candidate before, by its place; -1 for none."""
-        places = before.grid_map.centres_of(before._candidates)
-        index_of_cell = {
-            tuple(cell): index for index, cell in enumerate(self._candidates.tolist())
-        }
-        cells = self.grid_map.cells_of(places).tolist()
-        return np.array([index_of_cell.get(tuple(cell), -1) for cell in cells], dtype=np.int64)
+        """(G before,) present index of each candidate before; -1 for none.
+
+        Cells are told by their places, features by their coordinates.
+        """
+        old, now = before._candidates, self._candidates
+        keys = old.coordinates
+        if old.are_features != now.are_features:
+            return np.full(len(old), -1, dtype=np.int64)
+        if not old.are_features:
+            keys = self.grid_map.cells_of(before.grid_map.centres_of(keys))
+        index_of = {tuple(key): index for index, key in enumerate(now.coordinates.tolist())}
+        return np.array([index_of.get(tuple(key), -1) for key in keys.tolist()], dtype=np.int64)

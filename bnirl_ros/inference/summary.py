@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from bnirl_ros.demonstrations.demonstration import Demonstration
-from bnirl_ros.inference.posterior import Posterior
+from bnirl_ros.inference.posterior import Posterior, grid_world
 from bnirl_ros.inference.runs import runs
 from bnirl_ros.maps.grid_map import GridMap
+from bnirl_ros.model.candidates import Candidates
 from bnirl_ros.model.pursuits import PRIORS
 
 
@@ -23,12 +25,16 @@ class Subgoal:
     Attributes:
         rank: 1 for the subgoal with most observations, or, where the model knows pursuits, with
             most of them, and so on.
-        cell: (x, y) on the map, (0, 0) at the lower left.
+        cell: (x, y) on the map, (0, 0) at the lower left; of a feature subgoal, that of its cells
+            which is nearest to their middle.
         position: centre of the cell (x, y) in the map frame [m].
-        probability: share of the posterior draws in which the cell is a subgoal.
+        probability: share of the posterior draws in which it is a subgoal.
         observations: number of observations that the mode assigns to it.
         visit_order: 1-based positions in the visits of the first episode that visits it.
         pursuits: expected number of pursuits of it; None for a model that knows none.
+        feature: coordinates of a feature subgoal; None for a cell.
+        cells: all cells of a feature subgoal; none for a cell.
+        name: that the feature layer has for it; may be empty.
     """
 
     rank: int
@@ -38,6 +44,9 @@ class Subgoal:
     observations: int
     visit_order: tuple[int, ...]
     pursuits: float | None = None
+    feature: tuple[int, ...] | None = None
+    cells: tuple[tuple[int, int], ...] = ()
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -125,8 +134,9 @@ def summarise(posterior: Posterior, grid_map: GridMap) -> Summary:
     in_sequence = settings.model == "sequential"
     counts = posterior.pursuit_counts()
     cell_probability = np.zeros(grid_map.free.shape)
-    x, y = posterior.candidates.T
-    cell_probability[y, x] = (counts > 0).mean(axis=0)
+    all_cells = posterior.candidates.cells
+    goal_of = posterior.candidates.goals.goal_of
+    cell_probability[all_cells[:, 1], all_cells[:, 0]] = (counts > 0).mean(axis=0)[goal_of]
 
     subgoal_of = posterior.mode.subgoal_of
     if in_sequence and settings.arrival_radius > 0.0:
@@ -143,9 +153,13 @@ def summarise(posterior: Posterior, grid_map: GridMap) -> Summary:
     rank_of = np.zeros(len(demonstration), dtype=np.int64)
     rank_of[explained] = (np.argsort(by_rank) + 1)[index]
     ranked = candidates[by_rank]
-    cells = posterior.candidates[ranked]
-    sequence = _pursuits(demonstration, rank_of, _at_subgoal(posterior, grid_map, cells))
-    visits = _visits(sequence) if in_sequence else episode_visits(demonstration, cells, rank_of)
+    found = posterior.candidates.take(ranked)
+    sequence = _pursuits(demonstration, rank_of, _at_subgoal(posterior, grid_map, found))
+    visits = _visits(sequence) if in_sequence else episode_visits(demonstration, found, rank_of)
+    places = np.array(
+        [middle_of(found.cells_of(index)) for index in range(len(found))], dtype=np.int64
+    ).reshape(-1, 2)
+    names = grid_map.features.names if grid_map.features else {}
     probability = (counts > 0).mean(axis=0)
     subgoals = tuple(
         Subgoal(
@@ -163,9 +177,10 @@ def summarise(posterior: Posterior, grid_map: GridMap) -> Summary:
                 (),
             ),
             pursuits=float(pursuits[by_rank[rank - 1]]) if in_sequence else None,
+            **_feature(found, rank - 1, names),
         )
         for rank, (candidate, cell, position) in enumerate(
-            zip(ranked, cells, grid_map.centres_of(cells), strict=True), start=1
+            zip(ranked, places, grid_map.centres_of(places), strict=True), start=1
         )
     )
     return Summary(
@@ -190,14 +205,18 @@ def _regions(
 ) -> npt.NDArray[np.int32]:
     """(G,) for each candidate the one that stands for it: the first within the radius [cells].
 
-    Those of the mode stand for others, the one with most pursuits first.
+    Those of the mode stand for others, the one with most pursuits first. Features stand for
+    themselves.
     """
     region_of = np.arange(len(posterior.candidates), dtype=np.int32)
+    if posterior.candidates.are_features:
+        return region_of
+    cells = posterior.candidates.coordinates
     found = posterior.mode.subgoal_of[posterior.mode.subgoal_of >= 0]
     taken = np.zeros(len(region_of), dtype=np.bool_)
     for candidate in sorted(set(found.tolist()), key=lambda g: (-counts[:, g].sum(), g)):
         if not taken[candidate]:
-            apart = np.linalg.norm(posterior.candidates - posterior.candidates[candidate], axis=1)
+            apart = np.linalg.norm(cells - cells[candidate], axis=1)
             region = (apart <= radius) & ~taken
             region_of[region] = candidate
             taken |= region
@@ -205,13 +224,34 @@ def _regions(
 
 
 def _at_subgoal(
-    posterior: Posterior, grid_map: GridMap, cells: npt.NDArray[np.int64]
+    posterior: Posterior, grid_map: GridMap, found: Candidates
 ) -> npt.NDArray[np.bool_]:
-    """(N + L, J) whether each observation, then each last pose, is at each subgoal's cell."""
-    demonstration = posterior.demonstration
+    """(N + L, J) whether each observation, then each last pose, is at each subgoal's cells."""
+    demonstration, settings = posterior.demonstration, posterior.settings
     places = np.concatenate([demonstration.cells, demonstration.last_cells])
-    apart = np.linalg.norm(places[:, None] - cells, axis=2) * grid_map.resolution
-    return np.asarray(apart <= posterior.settings.arrival_radius)
+    radius = settings.arrival_radius / grid_map.resolution
+    return found.reached_in(grid_world(grid_map, settings), places, radius)
+
+
+def middle_of(cells: npt.NDArray[np.int64]) -> tuple[int, int]:
+    """That of the cells (M, 2) which is nearest to their mean: the first of equals."""
+    apart = np.linalg.norm(cells - cells.mean(axis=0), axis=1)
+    x, y = cells[int(np.argmin(apart))]
+    return int(x), int(y)
+
+
+def _feature(
+    found: Candidates, index: int, names: Mapping[tuple[int, ...], str]
+) -> dict[str, Any]:
+    """The fields of a `Subgoal` that only a feature subgoal has."""
+    if not found.are_features:
+        return {}
+    feature = tuple(found.coordinates[index].tolist())
+    return {
+        "feature": feature,
+        "cells": tuple((int(x), int(y)) for x, y in found.cells_of(index)),
+        "name": names.get(feature, ""),
+    }
 
 
 def _pursuits(
@@ -299,22 +339,23 @@ def nothing_found(grid_map: GridMap) -> Summary:
 
 def episode_visits(
     demonstration: Demonstration,
-    cells: npt.NDArray[np.int64],
+    found: Candidates,
     rank_of: npt.NDArray[np.int64],
 ) -> list[list[int]]:
     """Ranks of the subgoals that each episode visits, in order, without repetitions in a row.
 
     The paper's model knows no order, so it is read off the path: a subgoal is visited where the
-    demonstrator is in its cell, having pursued it (some observation was assigned to it) since the
-    last visit. One that is pursued in an episode but never reached counts where its last
-    observation was made.
+    demonstrator is in its cell, or one of its cells, having pursued it (some observation was
+    assigned to it) since the last visit. One that is pursued in an episode but never reached
+    counts where its last observation was made.
 
     Args:
         demonstration: N observations, and last poses.
-        cells: (J, 2) cells of the subgoals, rank 1 first.
+        found: the J subgoals, rank 1 first.
         rank_of: (N,) rank of the subgoal to which each observation is assigned.
     """
-    rank_of_cell = {(int(x), int(y)): rank for rank, (x, y) in enumerate(cells, start=1)}
+    ranks = (found.goals.goal_of + 1).tolist()
+    rank_of_cell = {(x, y): rank for (x, y), rank in zip(found.cells.tolist(), ranks, strict=True)}
     last_cell = {
         int(episode): (int(x), int(y))
         for episode, (x, y) in zip(

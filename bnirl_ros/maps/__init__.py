@@ -1,24 +1,30 @@
-"""Maps: occupancy, Nav2 map files and text grids, and the way between cells and metres.
+"""Maps: occupancy, Nav2 map files, text grids and features; the way between cells and metres.
 
-A map knows which cells are free and where they lie; what anybody does on it is not its business.
+A map knows which cells are free, where they lie and what features they have; what anybody does on
+it is not its business.
 """
 
 from pathlib import Path
 
 from bnirl_ros.errors import InputError
-from bnirl_ros.maps.grid_map import GridMap
+from bnirl_ros.maps.features import FeatureLayer, load_features, with_features
+from bnirl_ros.maps.grid_map import FeatureMap, GridMap
 from bnirl_ros.maps.nav2_map import read_nav2_map
 from bnirl_ros.maps.occupancy import map_from_occupancy, occupancy_of, yaw_of
 from bnirl_ros.maps.text_grid import parse_text_grid, read_text_grid
 
 __all__ = [
+    "FeatureLayer",
+    "FeatureMap",
     "GridMap",
+    "load_features",
     "load_map",
     "map_from_occupancy",
     "occupancy_of",
     "parse_text_grid",
     "read_nav2_map",
     "read_text_grid",
+    "with_features",
     "yaw_of",
 ]
 

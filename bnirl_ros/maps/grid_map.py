@@ -2,27 +2,45 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
 
 @dataclass(frozen=True, eq=False)
+class FeatureMap:
+    """A discrete feature vector Phi of each cell of a map (section 3.5).
+
+    Attributes:
+        coordinates: (height, width, k) int64 feature coordinates, indexed [y, x].
+        known: (height, width) bool which cells have any; the others belong to no feature subgoal.
+        names: of some coordinates.
+    """
+
+    coordinates: npt.NDArray[np.int64]
+    known: npt.NDArray[np.bool_]
+    names: Mapping[tuple[int, ...], str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
 class GridMap:
-    """Free space on a grid, as nav_msgs/OccupancyGrid places it.
+    """Free space on a grid, as nav_msgs/OccupancyGrid places it, and what is known of its cells.
 
     Attributes:
         free: (height, width) bool, indexed [y, x]; (0, 0) is the lower left cell.
         resolution: edge of a cell [m].
         origin: (x, y, yaw) of the lower left corner of cell (0, 0) in the frame [m, m, rad].
         frame_id: the frame in which positions are given.
+        features: of its cells, where subgoals are to be told by features; else None.
     """
 
     free: npt.NDArray[np.bool_]
     resolution: float = 1.0
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     frame_id: str = "map"
+    features: FeatureMap | None = None
 
     def cells_of(self, positions: npt.ArrayLike) -> npt.NDArray[np.int64]:
         """Cells (N, 2) in which the positions (N, 2) [m] lie; they may lie outside the map."""

@@ -60,6 +60,16 @@ class Goals:
         """(M,) goal to which each of `states` belongs."""
         return np.repeat(np.arange(len(self)), self.sizes)
 
+    def hold(self, states: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """(U, G) whether each of the states (U,) is one of each goal's."""
+        distinct, row_of = np.unique(np.asarray(states, dtype=np.int64), return_inverse=True)
+        held = np.zeros((len(distinct), len(self)), dtype=np.bool_)
+        if len(distinct):
+            rows = np.minimum(np.searchsorted(distinct, self.states), len(distinct) - 1)
+            same = distinct[rows] == self.states
+            held[rows[same], self.goal_of[same]] = True
+        return np.asarray(held[row_of])
+
     def rewards(self, goals: npt.ArrayLike, state_count: int) -> npt.NDArray[np.float64]:
         """(S, L) the rewards (20) of some of the goals, with c = 1."""
         chosen = np.asarray(goals, dtype=np.int64)

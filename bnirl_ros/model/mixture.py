@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bnirl_ros.mdp.goal_values import goal_values
+from bnirl_ros.mdp.goals import Goals
 from bnirl_ros.mdp.process import MarkovDecisionProcess
 from bnirl_ros.model.likelihood import action_log_likelihood
 
@@ -75,7 +76,7 @@ def subgoal_mixture(
     mdp: MarkovDecisionProcess,
     states: npt.ArrayLike,
     actions: npt.ArrayLike,
-    candidates: npt.ArrayLike,
+    candidates: npt.ArrayLike | Goals,
     alpha: float,
     eta: float,
 ) -> SubgoalMixture:
@@ -85,11 +86,11 @@ def subgoal_mixture(
         mdp: the grid world or finite MDP in which the observations were made.
         states: (N,) state number of each observation.
         actions: (N,) its action, one of `mdp.actions`.
-        candidates: (G,) state numbers in the support of P(g).
+        candidates: the goals in the support of P(g), or (G,) state numbers of single ones.
         alpha: confidence; above 0.
         eta: concentration; above 0.
     """
-    goals = np.asarray(candidates, dtype=np.int64)
+    goals = candidates if isinstance(candidates, Goals) else Goals.of_states(candidates)
     visited, state_index = np.unique(np.asarray(states), return_inverse=True)
     position = np.searchsorted(mdp.actions, np.asarray(actions))
     pairs, pair_of = np.unique(state_index * len(mdp.actions) + position, return_inverse=True)

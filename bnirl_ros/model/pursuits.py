@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bnirl_ros.mdp.goal_values import goal_values
+from bnirl_ros.mdp.goals import Goals
 from bnirl_ros.mdp.process import MarkovDecisionProcess
 from bnirl_ros.model.likelihood import delays, value_losses
 
@@ -92,7 +93,7 @@ class PursuitModel:
         state_part: (U,) int64 connected part of the map in which each state lies.
         candidate_part: (G,) int64 the same for the candidates: only those of the same part are
             ever pursued, so P(g) and the urn are each part's own.
-        place: (G, 2) int64 cell of each candidate.
+        place: (G, 2) int64 where each candidate lies: its cell, or the middle of its cells.
         fixed: values of the parameters in `PRIORS` that are not inferred.
         priors: of the parameters that are.
     """
@@ -184,7 +185,7 @@ def pursuit_model(
     states: npt.ArrayLike,
     actions: npt.ArrayLike,
     starts: npt.ArrayLike,
-    candidates: npt.ArrayLike,
+    candidates: npt.ArrayLike | Goals,
     arrived: npt.NDArray[np.bool_] | None = None,
     likelihood: str = "delay",
     fixed: Mapping[str, float] | None = None,
@@ -196,23 +197,27 @@ def pursuit_model(
         states: (N,) state number of each observation, in order.
         actions: (N,) its action, one of `mdp.actions`.
         starts: (N,) bool which observations begin an episode.
-        candidates: (G,) state numbers in the support of P(g).
+        candidates: the goals in the support of P(g), or (G,) state numbers of single ones.
         arrived: (U, G) whether each distinct state, in ascending order, counts as being at a
-            candidate; by default only the candidate itself.
+            candidate; by default only the candidate's own states.
         likelihood: "delay": actions cost steps, those that do the same are one action; "value":
             they cost value, equation (7) to the letter.
         fixed: values of parameters in `PRIORS` that are not to be inferred.
 
     Raises:
-        ValueError: an observation lies where no candidate can be reached.
+        ValueError: an observation lies where no candidate can be reached, or a candidate in more
+            than one part of the map.
     """
-    goals = np.asarray(candidates, dtype=np.int64)
+    goals = candidates if isinstance(candidates, Goals) else Goals.of_states(candidates)
     visited, state_of = np.unique(np.asarray(states, dtype=np.int64), return_inverse=True)
     action_of = np.searchsorted(mdp.actions, np.asarray(actions))
     parts = np.unique(
-        np.concatenate([mdp.parts_of(visited), mdp.parts_of(goals)]), return_inverse=True
+        np.concatenate([mdp.parts_of(visited), mdp.parts_of(goals.states)]), return_inverse=True
     )[1]
-    state_part, candidate_part = parts[: len(visited)], parts[len(visited) :]
+    state_part, goal_part = parts[: len(visited)], parts[len(visited) :]
+    candidate_part = goal_part[goals.first[:-1]]
+    if (goal_part != candidate_part[goals.goal_of]).any():
+        raise ValueError("a candidate lies in more than one part of the map")
     if not np.isin(state_part, candidate_part).all():
         raise ValueError("an observation lies where no candidate can be reached")
     values = goal_values(mdp, goals, visited, _VALUE_TOLERANCE)
@@ -230,10 +235,16 @@ def pursuit_model(
         state_of=state_of.astype(np.int64),
         action_of=action_of.astype(np.int64),
         starts=np.asarray(starts, dtype=np.bool_),
-        arrived=visited[:, None] == goals if arrived is None else arrived,
+        arrived=goals.hold(visited) if arrived is None else arrived,
         state_part=state_part,
         candidate_part=candidate_part,
-        place=mdp.places_of(goals),
+        place=_middles(mdp, goals),
         fixed=dict(fixed or {}),
         priors=priors,
     )
+
+
+def _middles(mdp: MarkovDecisionProcess, goals: Goals) -> npt.NDArray[np.int64]:
+    """(G, 2) the mean place of the states of each goal, rounded."""
+    sums = np.add.reduceat(mdp.places_of(goals.states), goals.first[:-1], axis=0)
+    return np.asarray(np.rint(sums / goals.sizes[:, np.newaxis]), dtype=np.int64)

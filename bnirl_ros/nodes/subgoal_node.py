@@ -25,7 +25,7 @@ from bnirl_ros.errors import InputError
 from bnirl_ros.inference.background import BackgroundInference, Result
 from bnirl_ros.inference.settings import Limits
 from bnirl_ros.inference.summary import Summary, nothing_found
-from bnirl_ros.maps.grid_map import GridMap
+from bnirl_ros.maps import FeatureLayer, GridMap, load_features, with_features
 from bnirl_ros.nodes.conversion import message_class, to_ros
 from bnirl_ros.nodes.parameters import NodeParameter, declare, declare_settings
 from bnirl_ros.nodes.process import run, spin
@@ -52,6 +52,11 @@ PARAMETERS = (
         "waiting_limit",
         40_000,
         Limits("poses, and actions, that may wait for the first map", lowest=0, highest=1e7),
+    ),
+    NodeParameter(
+        "features",
+        "",
+        Limits("file with features of the map's cells, for feature subgoals; empty: none"),
     ),
     NodeParameter(
         "result_folder",
@@ -94,6 +99,9 @@ class SubgoalNode(Node):
         own = declare(self, PARAMETERS)
         settings = declare_settings(self, lambda changed: self._inference.use_settings(changed))
         self._result_folder: str = own["result_folder"]
+        self._features: FeatureLayer | None = None
+        if own["features"]:
+            self._features = load_features(Path(own["features"]).expanduser())
         self._recorder = Recorder(own["waiting_limit"])
         self._inference = BackgroundInference(self._recorder, settings, own["episode_gap"])
         self._faults: Counter[str] = Counter()
@@ -149,6 +157,8 @@ class SubgoalNode(Node):
     def _on_map(self, message: Any) -> None:
         try:
             grid_map = map_of(message, "topic map")
+            if self._features:
+                grid_map = with_features(grid_map, self._features)
         except InputError as error:
             fault = str(error)
             self._faults[fault] += 1

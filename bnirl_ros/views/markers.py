@@ -30,12 +30,16 @@ STAY_LENGTH = 0.25
 """Reach along x and y of the cross that stands for staying [cells]: out of a subgoal's sphere."""
 
 
+_CELLS_OPACITY = 0.3  # of the cells of a feature subgoal: what lies on them is to be seen
+
+
 def subgoal_markers(summary: Summary, grid_map: GridMap, stamp_ns: int) -> MarkerArray:
     """A sphere, a heading and a label for each subgoal, all with the rank as id.
 
     Namespaces are `subgoal` (SPHERE), `heading` (ARROW, towards the next subgoal visited, see
-    `waypoints.headings`) and `label` (TEXT_VIEW_FACING, `wp_<rank> <probability>`). The first
-    marker is DELETEALL.
+    `waypoints.headings`) and `label` (TEXT_VIEW_FACING, `wp_<rank> <probability>`). A feature
+    subgoal has one more, `cells` (CUBE_LIST, flat and see-through), with all its cells; its sphere
+    is in the middle one of them. The first marker is DELETEALL.
 
     Args:
         summary: the posterior; positions are in the map frame [m].
@@ -48,6 +52,8 @@ def subgoal_markers(summary: Summary, grid_map: GridMap, stamp_ns: int) -> Marke
     markers = [_delete_all(header)]
     for subgoal in summary.subgoals:
         markers += _markers_of(subgoal, yaw[subgoal.rank], size, header)
+        if subgoal.cells:
+            markers.append(_cells_of(subgoal, grid_map, header))
     return MarkerArray(markers=markers)
 
 
@@ -126,6 +132,23 @@ def _markers_of(subgoal: Subgoal, yaw: float, size: float, header: Header) -> li
             text=f"wp_{subgoal.rank} {subgoal.probability:.2f}",
         ),
     ]
+
+
+def _cells_of(subgoal: Subgoal, grid_map: GridMap, header: Header) -> Marker:
+    """All cells of a feature subgoal."""
+    edge = grid_map.resolution
+    red, green, blue = colour_of(subgoal.rank)
+    return Marker(
+        header=header,
+        ns="cells",
+        id=subgoal.rank,
+        type=Marker.CUBE_LIST,
+        action=Marker.ADD,
+        pose=pose_of(grid_map.origin[:2], grid_map.origin[2]),
+        scale=Vector3(x=edge, y=edge, z=0.02 * edge),
+        color=ColorRGBA(r=red, g=green, b=blue, a=_CELLS_OPACITY),
+        points=[Point(x=(x + 0.5) * edge, y=(y + 0.5) * edge) for x, y in subgoal.cells],
+    )
 
 
 def _lines(pairs: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:

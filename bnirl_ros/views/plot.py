@@ -31,12 +31,21 @@ _KEY = 0.34  # From there to what they mean [inch].
 _LEGEND_LINE = 0.235  # Height of one line of the legend [inch].
 _LARGEST_LEGEND = 24  # Subgoals that the legend lists.
 # Width of the columns that it has, after the ranks [inch].
-_COLUMNS = {"cell": 0.93, "probability": 0.8, "observations": 0.95, "pursuits": 0.65, "order": 0.5}
+_COLUMNS = {
+    "cell": 0.93,
+    "feature": 0.93,
+    "probability": 0.8,
+    "observations": 0.95,
+    "pursuits": 0.65,
+    "order": 0.5,
+}
+_LETTER = 0.075  # Width of a letter in it [inch].
 
 _BLOCKED: Colour = (0.25, 0.28, 0.33)
 _FREE: Colour = (1.0, 1.0, 1.0)
 _GRID: Colour = (0.92, 0.93, 0.94)
 _ROUTE: Colour = (0.35, 0.38, 0.43)
+_TINT = 0.25  # Opacity of the colour on the cells of a feature subgoal.
 
 _ARROWS_FROM = 9.0  # Cells of this edge have room for arrows; smaller ones get dots [pt].
 _SMALLEST_DOT = 2.6  # Diameter [pt].
@@ -92,9 +101,9 @@ def draw_summary(
     Shown are the map (blocked cells dark); each distinct (cell, action) pair of the observations,
     as an arrow along the action or a dot for staying, coloured by the subgoal to which the mode
     assigns it and the wider the more often it occurs (on maps too fine for arrows, a dot); the
-    subgoals with their rank, with their probability beside it; and the ways from one to the next
-    as arrows, numbered in order (see `route_of`) and the wider the more often they were gone. Axes
-    are in cells.
+    cells of feature subgoals, tinted; the subgoals with their rank, with their probability beside
+    it; and the ways from one to the next as arrows, numbered in order (see `route_of`) and the
+    wider the more often they were gone. Axes are in cells.
 
     Args:
         summary: the posterior.
@@ -110,8 +119,8 @@ def draw_summary(
     table = subgoal_columns(summary.subgoals[:_LARGEST_LEGEND], summary.visit_sequence)
     columns = {name: texts for name, texts in table.items() if name in _COLUMNS}
     legend = (
-        _LEGEND_LEFT + sum(_COLUMNS[name] for name in columns) + 0.2,
-        _LEGEND_LINE * (len(columns["cell"]) + 5 + route.wide),
+        _LEGEND_LEFT + sum(_column_width(*column) for column in columns.items()) + 0.2,
+        _LEGEND_LINE * (len(columns["order"]) + 5 + route.wide),
     )
     layout = _layout(grid_map, legend, _TOP if title is None else _TITLED_TOP)
     width, height = layout.figure
@@ -126,6 +135,7 @@ def draw_summary(
         )
     )
     _draw_map(axes, grid_map, layout)
+    _draw_feature_cells(axes, summary, grid_map)
     _draw_observations(axes, summary, layout)
     numbers = _number_places(summary, route, layout)
     _draw_route(axes, route, numbers, layout)
@@ -184,6 +194,24 @@ def _draw_map(axes: Any, grid_map: GridMap, layout: _Layout) -> None:
     for spine in axes.spines.values():
         spine.set_color(_ROUTE)
         spine.set_linewidth(0.8)
+
+
+def _draw_feature_cells(axes: Any, summary: Summary, grid_map: GridMap) -> None:
+    """Tint the cells of feature subgoals with their colours."""
+    rows, columns = grid_map.free.shape
+    tints = np.zeros((rows, columns, 4))
+    for subgoal in summary.subgoals:
+        for x, y in subgoal.cells:
+            tints[y, x] = (*colour_of(subgoal.rank), _TINT)
+    if tints.any():
+        axes.imshow(
+            tints,
+            origin="lower",
+            extent=(-0.5, columns - 0.5, -0.5, rows - 0.5),
+            interpolation="nearest",
+            aspect="equal",
+            zorder=1.5,
+        )
 
 
 def _draw_observations(axes: Any, summary: Summary, layout: _Layout) -> None:
@@ -489,7 +517,7 @@ def _draw_legend(
     y = layout.top + 0.1
     x = sign
     for name, texts in columns.items():
-        x += _COLUMNS[name]
+        x += _column_width(name, texts)
         write(x, y, name, right=True)
         for line, text in enumerate(texts, start=1):
             write(x, y + line * _LEGEND_LINE, text, faint=False, right=True)
@@ -536,6 +564,11 @@ def _draw_legend(
         y += _LEGEND_LINE
         dot(y, UNEXPLAINED, 4)
         write(sign + _KEY, y, f"explained by no subgoal: {unexplained_share(summary)}")
+
+
+def _column_width(name: str, texts: Sequence[str]) -> float:
+    """Width of a column of the legend [inch]."""
+    return max(_COLUMNS[name], _LETTER * max(map(len, texts), default=0) + 0.25)
 
 
 def _key_of_observations(layout: _Layout) -> str:

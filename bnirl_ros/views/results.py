@@ -16,7 +16,7 @@ import numpy.typing as npt
 from bnirl_ros.errors import InputError
 from bnirl_ros.inference.posterior import Posterior
 from bnirl_ros.inference.settings import Settings
-from bnirl_ros.inference.summary import Subgoal, Summary
+from bnirl_ros.inference.summary import Subgoal, Summary, middle_of
 from bnirl_ros.maps.grid_map import GridMap
 from bnirl_ros.model.pursuits import PRIORS
 from bnirl_ros.views.plot import draw_summary
@@ -87,7 +87,9 @@ def subgoals_document(summary: Summary, grid_map: GridMap, settings: Settings) -
     below `visit_sequence` how often the pursuits go round it (`repetitions`, 0 for no loop), the
     pursuits of each of the `episodes`, from `first` to `last` by rows of `observations` in
     posterior.npz, and the expected share of `unexplained` observations. `parameters` are there
-    where the summary tells them, with median and central 90 % of the posterior.
+    where the summary tells them, with median and central 90 % of the posterior. A feature subgoal
+    has its coordinates as `feature`, all its `cells`, the `name` of the feature if it has one, and
+    no single `cell`.
     """
     known = {parameter.name: parameter.median for parameter in summary.parameters}
     return {
@@ -104,12 +106,13 @@ def subgoals_document(summary: Summary, grid_map: GridMap, settings: Settings) -
         "subgoals": [
             {
                 "rank": subgoal.rank,
-                "cell": list(subgoal.cell),
+                "cell": list(subgoal.cell) if subgoal.feature is None else None,
                 "position": list(subgoal.position),
                 "probability": subgoal.probability,
                 "observations": subgoal.observations,
                 "visit_order": list(subgoal.visit_order),
                 **({} if subgoal.pursuits is None else {"pursuits": subgoal.pursuits}),
+                **_feature(subgoal),
             }
             for subgoal in summary.subgoals
         ],
@@ -122,6 +125,17 @@ def subgoals_document(summary: Summary, grid_map: GridMap, settings: Settings) -
             "chains": summary.chains,
             "draws": summary.draws,
         },
+    }
+
+
+def _feature(subgoal: Subgoal) -> dict[str, Any]:
+    """What the document tells of a feature subgoal alone."""
+    if subgoal.feature is None:
+        return {}
+    return {
+        "feature": list(subgoal.feature),
+        "cells": [list(cell) for cell in subgoal.cells],
+        **({"name": subgoal.name} if subgoal.name else {}),
     }
 
 
@@ -171,12 +185,15 @@ def subgoals_in(document: Mapping[str, Any]) -> tuple[Subgoal, ...]:
     return tuple(
         Subgoal(
             rank=entry["rank"],
-            cell=(entry["cell"][0], entry["cell"][1]),
+            cell=tuple(entry["cell"]) if entry["cell"] else middle_of(np.array(entry["cells"])),
             position=(entry["position"][0], entry["position"][1]),
             probability=entry["probability"],
             observations=entry["observations"],
             visit_order=tuple(entry["visit_order"]),
             pursuits=entry.get("pursuits"),
+            feature=tuple(entry["feature"]) if "feature" in entry else None,
+            cells=tuple((x, y) for x, y in entry.get("cells", [])),
+            name=entry.get("name", ""),
         )
         for entry in document["subgoals"]
     )
@@ -185,7 +202,7 @@ def subgoals_in(document: Mapping[str, Any]) -> tuple[Subgoal, ...]:
 def posterior_arrays(posterior: Posterior) -> dict[str, npt.NDArray[Any]]:
     """The arrays of posterior.npz: those of the sequential model tell its parameters, too."""
     arrays: dict[str, npt.NDArray[Any]] = {
-        "candidates": posterior.candidates,
+        "candidates": posterior.candidates.coordinates,
         "observations": posterior.demonstration.observations,
         "subgoal_of": posterior.draws.subgoal_of,
         "partition_of": posterior.draws.partition_of,

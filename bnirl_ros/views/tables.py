@@ -35,13 +35,14 @@ def subgoal_columns(
 ) -> dict[str, list[str]]:
     """What a table tells of the subgoals, by heading.
 
-    Columns: rank; cell (x, y); place, the centre of the cell in the map frame [m]; probability;
+    Columns: rank; cell (x, y), or the name or the coordinates of the feature; place, the centre of
+    the cell (of a feature, of the middle one of its cells) in the map frame [m]; probability;
     number of observations; where the model knows pursuits, their expected number; order, the
     1-based position in the visit sequence.
     """
     columns = {
         "rank": [str(subgoal.rank) for subgoal in subgoals],
-        "cell": ["({}, {})".format(*subgoal.cell) for subgoal in subgoals],
+        _heading(subgoals): [_what(subgoal) for subgoal in subgoals],
         "place [m]": ["({:.2f}, {:.2f})".format(*subgoal.position) for subgoal in subgoals],
         "probability": [f"{subgoal.probability:.2f}" for subgoal in subgoals],
         "observations": [str(subgoal.observations) for subgoal in subgoals],
@@ -51,6 +52,15 @@ def subgoal_columns(
         columns["pursuits"] = [f"{expected:.1f}" for expected in pursuits]
     order = {rank: position for position, rank in enumerate(visit_sequence, start=1)}
     return columns | {"order": [str(order.get(subgoal.rank, "-")) for subgoal in subgoals]}
+
+
+def _heading(subgoals: Sequence[Subgoal]) -> str:
+    """What the subgoals are, by the first one: all are of the same kind."""
+    return "feature" if any(subgoal.feature is not None for subgoal in subgoals) else "cell"
+
+
+def _what(subgoal: Subgoal) -> str:
+    return subgoal.name or "({})".format(", ".join(map(str, subgoal.feature or subgoal.cell)))
 
 
 def parameter_table(parameters: Sequence[Parameter]) -> str:

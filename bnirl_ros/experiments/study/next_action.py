@@ -52,7 +52,7 @@ def predict_exchangeable(
         world,
         world.states_of(held_out.cells),
         held_out.action,
-        world.states_of(posterior.candidates),
+        posterior.candidates.goals,
         **settings.fixed,
     )
     drawn = posterior.draws.subgoal_of.reshape(-1)
