@@ -282,6 +282,55 @@ def test_after_a_replay_human_play_gives_the_posterior_of_the_command(
     replay_and_compare(bag, {"sweeps": 2000, "burn_in": 500}, tmp_path, start, subgoals)
 
 
+def test_feature_subgoals_live_are_those_of_the_command_and_show_all_their_cells(
+    tmp_path: Path, start: StartNode, subgoals: Callable[..., Subgoals]
+) -> None:
+    live, offline, rooms = tmp_path / "live", tmp_path / "offline", tmp_path / "rooms.txt"
+    blocks = np.arange(20) // 5
+    np.savetxt(rooms, 10 * blocks[::-1, np.newaxis] + blocks, fmt="%d")
+    settings = {"sweeps": 300, "burn_in": 100, "features": rooms}
+    options = [f"--{name.replace('_', '-')}={value}" for name, value in settings.items()]
+    assert cli.main(["infer", str(PAPER_BAG), "--out", str(offline), *options]) == 0
+
+    node = subgoals(result_folder=live, **settings)
+    assert start("replay_node", PAPER_BAG, "--fast").end().status == 0
+    recorded = read_demonstration(PAPER_BAG, {})
+    node.until_settled(len(place(recorded.recording, recorded.grid_map).demonstration))
+    response = node.call("infer")
+    assert response.success, response.message
+    assert_same_results(live, offline)
+
+    entries = {
+        entry["rank"]: entry
+        for entry in json.loads((live / "subgoals.json").read_text())["subgoals"]
+    }
+    node.peer.until(
+        lambda: (
+            {each.id for each in node.outputs["subgoals"][-1].markers if each.ns} == {*entries}
+        ),
+        "the subgoals of the inference",
+    )
+    sets = [each for each in node.outputs["subgoals"][-1].markers if each.ns == "cells"]
+    assert [each.id for each in sets] == list(entries)
+    for each in sets():
+        assert each.type == each.CUBE_LIST
+        shown = {(math.floor(point.x), math.floor(point.y)) for point in each.points}
+        assert shown == {(x, y) for x, y in entries[each.id]["cells"]}
+
+
+def test_features_that_do_not_fit_the_map_are_told(
+    tmp_path: Path, start: StartNode, subgoals: Callable[..., Subgoals]
+) -> None:
+    end = start("subgoal_node", *as_arguments({"features": tmp_path / "none.txt"})).end()
+    assert end.status == 1
+    assert "none.txt: the features cannot be read" in end.err
+    assert "Traceback" not in end.err
+    (tmp_path / "small.txt").write_text("1 2\n")
+    node = subgoals(features=tmp_path / "small.txt")
+    node.send([map_of_grid()], walk())
+    node.peer.until(lambda: "has 2 x 1 labels, the map" in node.process.err, "a warning")
+
+
 # What it publishes
 
 
