@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from bnirl_ros.experiments.printed_sum import PlainSampler
 from bnirl_ros.inference import partition_gibbs
 from bnirl_ros.inference.diagnostics import effective_sample_size
 from bnirl_ros.inference.draws import Draws
@@ -20,7 +21,7 @@ from bnirl_ros.mdp.goal_values import goal_values
 from bnirl_ros.mdp.grid_world import GridWorld
 from bnirl_ros.model.likelihood import action_log_likelihood
 from bnirl_ros.model.mixture import SubgoalMixture
-from reference import Enumeration, PlainSampler
+from reference import Enumeration
 
 CORRIDOR = np.ones((1, 7), dtype=bool)
 ROOMS = np.array([[1, 1, 1, 0, 1], [1, 0, 1, 1, 1], [1, 1, 1, 0, 1]], dtype=bool)

@@ -27,6 +27,7 @@ from bnirl_ros.experiments.demonstration_bag import (
     write_what_fits,
 )
 from bnirl_ros.experiments.identifiability import mode_subgoals
+from bnirl_ros.experiments.printed_sum import shares
 from bnirl_ros.experiments.scenarios import (
     PAPER_LOOP,
     SCENARIOS,
@@ -382,3 +383,14 @@ def test_the_command_leaves_other_files_alone(tmp_path: Path) -> None:
     assert make_bags.main([*sources, "--out", str(tmp_path)]) == 0
     assert (tmp_path / "paper_loop" / "NOTES").is_file()
     assert {path.name for path in tmp_path.iterdir()} == set(NAMES)
+
+
+# The printed sum
+
+
+def test_the_product_finds_the_loops_subgoals_and_the_printed_sum_does_not() -> None:
+    product = shares(seed=0, printed_sum=False, sweeps=40, burn_in=20)
+    printed = shares(seed=0, printed_sum=True, sweeps=40, burn_in=20)
+    assert min(product.of_subgoal) >= 0.9
+    assert max(printed.of_subgoal) <= 0.7
+    assert printed.subgoals > 2 * product.subgoals
