@@ -103,46 +103,23 @@ class FiniteMDP:
     @property
     def _motion(self) -> tuple[Any, ...]:
         """What the kernels take of the process."""
-        return (
-            self.row_starts,
-            self.successors,
-            self.probabilities,
-            self.action_count,
-            self.discount,
-        )
+        return self.row_starts, self.successors, self.probabilities, self.action_count
 
-    def goal_values_of(
+    def solve(
         self,
+        rewards: npt.NDArray[np.float64],
         goals: npt.NDArray[np.int64],
-        states: npt.NDArray[np.int64],
         tolerance: float,
-    ) -> npt.NDArray[np.float64]:
-        """Q*(s, a, R_g) of a few goals at once; see `bnirl_ros.mdp.goal_values.goal_values`."""
-        first_passage = np.zeros((self.state_count, len(goals)))
-        first_passage[goals, np.arange(len(goals))] = 1.0
-        rewards = np.zeros((1, len(goals)))
-        _solve(*self._motion, rewards, goals, tolerance, first_passage)
-        return _goal_action_values(*self._motion, goals, states, first_passage)
-
-    def optimal_values_of(
-        self,
-        rewards: npt.NDArray[np.float64],
-        start: npt.NDArray[np.float64],
-        tolerance: float,
-    ) -> npt.NDArray[np.float64]:
-        """V*(s, R) (S, L); see `bnirl_ros.mdp.reward_values.optimal_values`."""
-        values = start.copy()
-        _solve(*self._motion, rewards, np.full(rewards.shape[1], -1), tolerance, values)
-        return values
-
-    def action_values_of(
-        self,
-        rewards: npt.NDArray[np.float64],
         values: npt.NDArray[np.float64],
-        states: npt.NDArray[np.int64],
+    ) -> None:
+        """See `bnirl_ros.mdp.process.MarkovDecisionProcess.solve`."""
+        _solve(*self._motion, self.discount, rewards, goals, tolerance, values)
+
+    def expected_values(
+        self, values: npt.NDArray[np.float64], states: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.float64]:
-        """Q(s, a, R) (U, A, L); see `bnirl_ros.mdp.reward_values.action_values`."""
-        return _action_values(*self._motion, rewards, values, states)
+        """(U, A, L) the mean of values (S, L) after each action in each of the states (U,)."""
+        return _expected_values(*self._motion, values, states)
 
 
 _Coordinates = tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any], tuple[int, int]]
@@ -181,15 +158,6 @@ class _DenseEntries:
         dense = np.asarray(matrix, dtype=np.float64)
         self.row, self.col = np.nonzero(dense)
         self.data = dense[self.row, self.col]
-
-
-@njit(nogil=True, cache=True)
-def _expected(row_starts, successors, probabilities, row, values, lane):  # type: ignore[no-untyped-def]
-    """Mean of values[:, lane] over the outcomes of one row."""
-    mean = 0.0
-    for entry in range(row_starts[row], row_starts[row + 1]):
-        mean += probabilities[entry] * values[successors[entry], lane]
-    return mean
 
 
 @njit(nogil=True, cache=True)
@@ -236,47 +204,18 @@ def _solve(  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _action_values(  # type: ignore[no-untyped-def]
-    row_starts, successors, probabilities, action_count, discount, rewards, values, states
+def _expected_values(  # type: ignore[no-untyped-def]
+    row_starts, successors, probabilities, action_count, values, states
 ):
-    """Q (U, A, L) at `states`: R(s) + gamma E[V(s')]."""
+    """(U, A, L) the mean of values (S, L) after each action in each of the states (U,)."""
     state_count = (row_starts.shape[0] - 1) // action_count
-    rows = (row_starts, successors, probabilities)
-    result = np.empty((states.shape[0], action_count, values.shape[1]))
-    for lane in range(values.shape[1]):
-        for index in range(states.shape[0]):
-            state = states[index]
-            for action in range(action_count):
-                mean = _expected(*rows, action * state_count + state, values, lane)
-                result[index, action, lane] = rewards[state, lane] + discount * mean
-    return result
-
-
-@njit(nogil=True, cache=True)
-def _goal_action_values(  # type: ignore[no-untyped-def]
-    row_starts,
-    successors,
-    probabilities,
-    action_count,
-    discount,
-    goals,
-    states,
-    first_passage,
-):
-    """Q* (U, A, G) at `states`: V_g = h_g V_g(g), V_g(g) = 1 + gamma V_g(g) max_a E[h_g]."""
-    rows = (row_starts, successors, probabilities)
-    state_count = (row_starts.shape[0] - 1) // action_count
-    values = np.empty((states.shape[0], action_count, goals.shape[0]))
-    for lane in range(goals.shape[0]):
-        goal = goals[lane]
-        best = -np.inf
+    lanes = values.shape[1]
+    expected = np.zeros((states.shape[0], action_count, lanes))
+    for index in range(states.shape[0]):
         for action in range(action_count):
-            best = max(best, _expected(*rows, action * state_count + goal, first_passage, lane))
-        goal_value = 1.0 / (1.0 - discount * best)
-        for index in range(states.shape[0]):
-            reward = 1.0 if states[index] == goal else 0.0
-            for action in range(action_count):
-                row = action * state_count + states[index]
-                mean = _expected(*rows, row, first_passage, lane)
-                values[index, action, lane] = reward + discount * goal_value * mean
-    return values
+            row = action * state_count + states[index]
+            for entry in range(row_starts[row], row_starts[row + 1]):
+                for lane in range(lanes):
+                    mean = probabilities[entry] * values[successors[entry], lane]
+                    expected[index, action, lane] += mean
+    return expected

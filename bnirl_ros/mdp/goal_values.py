@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from bnirl_ros.mdp.goals import Goals
 from bnirl_ros.mdp.process import TOLERANCE, MarkovDecisionProcess, checked_states
-from bnirl_ros.mdp.reward_values import optimal_values
+from bnirl_ros.mdp.reward_values import action_values, optimal_values
 
 _GOALS_AT_ONCE = 16  # lanes: enough to fill the vector units, few enough to stay in the caches
 
@@ -50,13 +50,12 @@ def goal_values(
 
     def solve(batch: npt.NDArray[np.int64]) -> None:
         if all_goals.sizes[batch[0]] == 1:
-            values[:, :, batch] = mdp.goal_values_of(
-                all_goals.states[all_goals.first[batch]], observed, first_passage_tolerance
-            )
+            single = all_goals.states[all_goals.first[batch]]
+            values[:, :, batch] = _of_single_states(mdp, single, observed, first_passage_tolerance)
         else:
             rewards = all_goals.rewards(batch, mdp.state_count)
             of_state = optimal_values(mdp, rewards, tolerance)
-            values[:, :, batch] = mdp.action_values_of(rewards, of_state, observed)
+            values[:, :, batch] = action_values(mdp, rewards, of_state, observed)
 
     batches = [
         kind[start : start + _GOALS_AT_ONCE]
@@ -70,3 +69,21 @@ def goal_values(
             threads.shutdown(wait=False, cancel_futures=True)  # Ctrl-C waits for one batch only
             raise
     return values
+
+
+def _of_single_states(
+    mdp: MarkovDecisionProcess,
+    goals: npt.NDArray[np.int64],
+    states: npt.NDArray[np.int64],
+    tolerance: float,
+) -> npt.NDArray[np.float64]:
+    """Q* (U, A, L): V_g = h_g V_g(g), where V_g(g) = 1 + gamma V_g(g) max_a E[h_g]."""
+    lanes = np.arange(len(goals))
+    first_passage = np.zeros((mdp.state_count, len(goals)))
+    first_passage[goals, lanes] = 1.0
+    mdp.solve(np.zeros((1, len(goals))), goals, tolerance, first_passage)
+    from_goal = mdp.expected_values(first_passage, goals)[lanes, :, lanes].max(axis=1)
+    goal_value = 1.0 / (1.0 - mdp.discount * from_goal)
+    reward = (states[:, np.newaxis] == goals).astype(np.float64)
+    expected = mdp.expected_values(first_passage, states)
+    return np.asarray(reward[:, np.newaxis] + mdp.discount * goal_value * expected)

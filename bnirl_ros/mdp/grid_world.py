@@ -138,41 +138,23 @@ class GridWorld:
     def _motion(self) -> tuple[Any, ...]:
         """What the kernels take of the world."""
         spread = (1.0 - self.success) / (len(self.offsets) - 1)
-        return self.open_moves, self.offsets, self.success, spread, self.discount
+        return self.open_moves, self.offsets, self.success, spread
 
-    def goal_values_of(
+    def solve(
         self,
+        rewards: npt.NDArray[np.float64],
         goals: npt.NDArray[np.int64],
-        states: npt.NDArray[np.int64],
         tolerance: float,
-    ) -> npt.NDArray[np.float64]:
-        """Q*(s, a, R_g) of a few goals at once; see `bnirl_ros.mdp.goal_values.goal_values`."""
-        first_passage = np.zeros((self.state_count, len(goals)))
-        first_passage[goals, np.arange(len(goals))] = 1.0
-        rewards = np.zeros((1, len(goals)))
-        _solve(*self._motion, rewards, goals, tolerance, first_passage)
-        return _goal_action_values(*self._motion, goals, states, first_passage)
-
-    def optimal_values_of(
-        self,
-        rewards: npt.NDArray[np.float64],
-        start: npt.NDArray[np.float64],
-        tolerance: float,
-    ) -> npt.NDArray[np.float64]:
-        """V*(s, R) (S, L); see `bnirl_ros.mdp.reward_values.optimal_values`."""
-        values = np.where(self.free.reshape(-1, 1), start, 0.0)
-        no_goal = np.full(rewards.shape[1], -1)
-        _solve(*self._motion, rewards, no_goal, tolerance, values)
-        return values
-
-    def action_values_of(
-        self,
-        rewards: npt.NDArray[np.float64],
         values: npt.NDArray[np.float64],
-        states: npt.NDArray[np.int64],
+    ) -> None:
+        """See `bnirl_ros.mdp.process.MarkovDecisionProcess.solve`."""
+        _solve(*self._motion, self.discount, rewards, goals, tolerance, values)
+
+    def expected_values(
+        self, values: npt.NDArray[np.float64], states: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.float64]:
-        """Q(s, a, R) (U, A, L); see `bnirl_ros.mdp.reward_values.action_values`."""
-        return _action_values(*self._motion, rewards, values, states)
+        """(U, A, L) the mean of values (S, L) after each action in each of the states (U,)."""
+        return _expected_values(*self._motion, values, states)
 
 
 @njit(nogil=True, cache=True)
@@ -227,50 +209,21 @@ def _solve(open_moves, offsets, success, spread, discount, rewards, goals, toler
 
 
 @njit(nogil=True, cache=True)
-def _expected(values, lane, state, bits, offsets, success, spread, expected):  # type: ignore[no-untyped-def]
-    """Fill expected (A,) with the mean of values[:, lane] after each action in `state`."""
-    total = 0.0
-    for action in range(offsets.shape[0]):
-        outcome = state + offsets[action] if (bits >> action) & 1 else state
-        expected[action] = values[outcome, lane]
-        total += values[outcome, lane]
-    for action in range(offsets.shape[0]):
-        expected[action] = (success - spread) * expected[action] + spread * total
-
-
-@njit(nogil=True, cache=True)
-def _action_values(open_moves, offsets, success, spread, discount, rewards, values, states):  # type: ignore[no-untyped-def]
-    """Q (U, A, L) at `states`: R(s) + gamma E[V(s')]."""
+def _expected_values(open_moves, offsets, success, spread, values, states):  # type: ignore[no-untyped-def]
+    """(U, A, L) the mean of values (S, L) after each action in each of the states (U,)."""
     bits = open_moves.reshape(-1)
     action_count = offsets.shape[0]
-    result = np.empty((states.shape[0], action_count, values.shape[1]))
-    expected = np.empty(action_count)
-    for lane in range(values.shape[1]):
-        for index in range(states.shape[0]):
-            state = states[index]
-            _expected(values, lane, state, bits[state], offsets, success, spread, expected)
+    lanes = values.shape[1]
+    expected = np.empty((states.shape[0], action_count, lanes))
+    for index in range(states.shape[0]):
+        state = states[index]
+        for lane in range(lanes):
+            total = 0.0
             for action in range(action_count):
-                result[index, action, lane] = rewards[state, lane] + discount * expected[action]
-    return result
-
-
-@njit(nogil=True, cache=True)
-def _goal_action_values(  # type: ignore[no-untyped-def]
-    open_moves, offsets, success, spread, discount, goals, states, first_passage
-):
-    """Q* (U, A, G) at `states`: V_g = h_g V_g(g), V_g(g) = 1 + gamma V_g(g) max_a E[h_g]."""
-    bits = open_moves.reshape(-1)
-    action_count = offsets.shape[0]
-    values = np.empty((states.shape[0], action_count, goals.shape[0]))
-    expected = np.empty(action_count)
-    for lane in range(goals.shape[0]):
-        goal = goals[lane]
-        _expected(first_passage, lane, goal, bits[goal], offsets, success, spread, expected)
-        goal_value = 1.0 / (1.0 - discount * expected.max())
-        for index in range(states.shape[0]):
-            state = states[index]
-            _expected(first_passage, lane, state, bits[state], offsets, success, spread, expected)
-            reward = 1.0 if state == goal else 0.0
+                outcome = state + offsets[action] if (bits[state] >> action) & 1 else state
+                expected[index, action, lane] = values[outcome, lane]
+                total += values[outcome, lane]
             for action in range(action_count):
-                values[index, action, lane] = reward + discount * goal_value * expected[action]
-    return values
+                mean = (success - spread) * expected[index, action, lane] + spread * total
+                expected[index, action, lane] = mean
+    return expected

@@ -14,8 +14,9 @@ TOLERANCE = 1e-8
 class MarkovDecisionProcess(Protocol):
     """What the method needs of an MDP without reward.
 
-    That is a discount, the values of goals and of rewards, which actions do the same, which states
-    lie in parts between which there is no way, and which lie near each other.
+    That is a discount, the fixed point of Bellman's equation and means after actions, which
+    actions do the same, which states lie in parts between which there is no way, and which lie
+    near each other.
     """
 
     @property
@@ -27,23 +28,27 @@ class MarkovDecisionProcess(Protocol):
     @property
     def state_count(self) -> int: ...
 
-    def goal_values_of(
-        self, goals: npt.NDArray[np.int64], states: npt.NDArray[np.int64], tolerance: float
-    ) -> npt.NDArray[np.float64]: ...
-
-    def optimal_values_of(
+    def solve(
         self,
         rewards: npt.NDArray[np.float64],
-        start: npt.NDArray[np.float64],
+        goals: npt.NDArray[np.int64],
         tolerance: float,
-    ) -> npt.NDArray[np.float64]: ...
-
-    def action_values_of(
-        self,
-        rewards: npt.NDArray[np.float64],
         values: npt.NDArray[np.float64],
-        states: npt.NDArray[np.int64],
-    ) -> npt.NDArray[np.float64]: ...
+    ) -> None:
+        """Bring values (S, L) to V(s) = R(s) + gamma max_a E[V(s')], but for V(goals[l]).
+
+        Args:
+            rewards: (S, L), or (1, L) for the same reward in all states.
+            goals: (L,) state whose value is kept, in each lane; -1 for none.
+            tolerance: bound on the absolute error.
+            values: where to begin, and the result.
+        """
+
+    def expected_values(
+        self, values: npt.NDArray[np.float64], states: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.float64]:
+        """(U, A, L) the mean of values (S, L) after each action in each of the states (U,)."""
+        ...
 
     def same_action(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]: ...
 

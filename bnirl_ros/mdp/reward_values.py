@@ -25,7 +25,8 @@ def optimal_values(
             they are near, there is little to do.
 
     Returns:
-        (S, L) float64; in blocked cells of a grid world, which are states that never occur, 0.
+        (S, L) float64; in blocked cells of a grid world, which are states that never occur, those
+        of `start`.
 
     Raises:
         ValueError: a shape is not (S, L).
@@ -34,7 +35,8 @@ def optimal_values(
     values = np.zeros_like(given) if start is None else np.array(start, dtype=np.float64)
     if given.ndim != 2 or len(given) != mdp.state_count or values.shape != given.shape:
         raise ValueError(f"rewards and start must both be ({mdp.state_count}, L)")
-    return mdp.optimal_values_of(given, values, tolerance)
+    mdp.solve(given, np.full(given.shape[1], -1), tolerance, values)
+    return values
 
 
 def action_values(
@@ -44,4 +46,5 @@ def action_values(
     states: npt.ArrayLike,
 ) -> npt.NDArray[np.float64]:
     """Q(s, a, R) (U, A, L) of state values (S, L) under rewards (S, L), at the states (U,)."""
-    return mdp.action_values_of(rewards, values, checked_states(mdp, states, "state"))
+    at = checked_states(mdp, states, "state")
+    return rewards[at, np.newaxis] + mdp.discount * mdp.expected_values(values, at)
