@@ -1,4 +1,8 @@
-"""Small kernels that several samplers need."""
+"""Small kernels that several samplers need.
+
+For an argument that is a literal, or a variable that begins as one, numba compiles a kernel once
+more, with all that it calls: numbers that are handed to large kernels are np.int64 from the start.
+"""
 
 from __future__ import annotations
 

@@ -402,7 +402,7 @@ def _draw_blocks(model, state, chosen, forward, generator):  # type: ignore[no-u
     length = int(_SHORTEST_BLOCK * math.exp(generator.random() * span))
     limit = 1 + int(generator.random() * length)
     count = model.starts.shape[0]
-    first = 0
+    first = np.int64(0)
     while first < count:
         end = first + 1
         while end < count and end - first < limit and not model.starts[end]:
@@ -864,7 +864,7 @@ def _draw_concentration(model, state, generator):  # type: ignore[no-untyped-def
             nothing,
             nothing,
         )
-        _draw_by_slice(model, state.parameters, ETA, evidence, generator)
+        _draw_by_slice(model, state.parameters, np.int64(ETA), evidence, generator)
 
 
 @njit(nogil=True, cache=True)
@@ -895,9 +895,9 @@ def _draw_action_parameters(model, state, chosen, confidence_too, generator):  #
         none, none, costs[:rows], times[:rows], uniform[:rows], none, times[:0], times[:0]
     )
     if not model.is_fixed[SLIP]:
-        _draw_by_slice(model, state.parameters, SLIP, evidence, generator)
+        _draw_by_slice(model, state.parameters, np.int64(SLIP), evidence, generator)
     if confidence_too and not model.is_fixed[ALPHA]:
-        _draw_by_slice(model, state.parameters, ALPHA, evidence, generator)
+        _draw_by_slice(model, state.parameters, np.int64(ALPHA), evidence, generator)
 
 
 @njit(nogil=True, cache=True)

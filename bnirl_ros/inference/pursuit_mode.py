@@ -38,9 +38,10 @@ from bnirl_ros.inference.pursuit_gibbs import (
 from bnirl_ros.model.pursuits import PRIORS, PursuitModel
 
 _GAIN = 1e-9  # nats; a smaller gain is rounding
-_BLOCKS = (1024, 32)  # observations that the Viterbi algorithm takes at once
+_BLOCKS = (np.int64(1024), np.int64(32))  # observations that the Viterbi algorithm takes at once
 _FEW = 4  # draws; a subgoal with more of them is not worth giving up
 _REPLACEMENTS = 8  # candidates tried in its place, the most likely ones
+_NONE = np.int64(-1)  # in the place of a candidate
 
 
 def posterior_mode(model: PursuitModel, chains: Draws) -> Mode:
@@ -121,7 +122,7 @@ def _ascend(model, state):  # type: ignore[no-untyped-def]
                 else:
                     _replace(state, candidate, replacement)
                     for length in _BLOCKS:
-                        _improve_blocks(model, state, likely, length, replacement, -1)
+                        _improve_blocks(model, state, likely, length, replacement, _NONE)
                 trial = log_joint_of(model, state, chosen)
                 if trial > value + _GAIN:
                     value = trial
@@ -156,7 +157,7 @@ def _replacements(model, state, chosen, candidate):  # type: ignore[no-untyped-d
     for t in range(state.subgoal_of.shape[0]):
         if state.subgoal_of[t] == candidate:
             state.partition_of[t] = 0
-    scores = group_scores(model, state, chosen, 2)[0]
+    scores = group_scores(model, state, chosen, np.int64(2))[0]
     likely = scores.argsort()[::-1][:_REPLACEMENTS]
     # Those of another part of the map, at -inf, are none.
     likely = likely[(scores[likely] > -np.inf) & (likely != candidate)]
@@ -189,7 +190,7 @@ def _climb(model, state, chosen, likely):  # type: ignore[no-untyped-def]
     value = log_joint_of(model, state, chosen)
     while True:
         for length in _BLOCKS:
-            _improve_blocks(model, state, likely, length, -1, -1)
+            _improve_blocks(model, state, likely, length, _NONE, _NONE)
         _move_subgoals(model, state, chosen)
         now = log_joint_of(model, state, chosen)
         if now <= value + _GAIN:
@@ -205,7 +206,7 @@ def _improve_blocks(model, state, likely, length, concerned, forbidden):  # type
     the best path without it.
     """
     count = model.starts.shape[0]
-    first = 0
+    first = np.int64(0)
     while first < count:
         end = first + 1
         while end < count and end - first < length and not model.starts[end]:
@@ -321,7 +322,7 @@ def _move_subgoals(model, state, chosen):  # type: ignore[no-untyped-def]
     """All pursuits of a subgoal to the candidate that suits them best, if the joint gains."""
     candidates = state.counts.shape[0]
     group_of = np.full(candidates, -1, dtype=np.int32)
-    groups = 0
+    groups = np.int64(0)
     for t in range(state.subgoal_of.shape[0]):
         if group_of[state.subgoal_of[t]] < 0:
             group_of[state.subgoal_of[t]] = groups
