@@ -185,6 +185,16 @@ def test_finite_mdp_takes_every_sparse_form() -> None:
         np.testing.assert_allclose(goal_values(mdp, [4], np.arange(6)), expected, atol=2e-8)
 
 
+def test_finite_mdp_gives_its_own_transitions() -> None:
+    generator = np.random.default_rng(0)
+    transitions = generator.random((3, 5, 5)) * (generator.random((3, 5, 5)) < 0.5)
+    transitions[:, :, 2] += 0.1
+    transitions /= transitions.sum(axis=2, keepdims=True)
+    layers = FiniteMDP.from_transitions(transitions, 0.9).transitions()
+    assert len(layers) == 3
+    np.testing.assert_array_equal(np.stack([layer.toarray() for layer in layers]), transitions)
+
+
 @pytest.mark.parametrize(
     ("transitions", "words"),
     [

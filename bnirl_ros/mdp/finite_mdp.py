@@ -100,6 +100,16 @@ class FiniteMDP:
         """(U, 2) where each state lies: nobody knows, so far away from every other."""
         return np.stack([1000 * states, np.zeros_like(states)], axis=1)
 
+    def transitions(self) -> list[Any]:
+        """Transition probabilities, an array (S, S) in compressed sparse rows for each action."""
+        from scipy.sparse import csr_array  # here, since only this conversion needs it
+
+        rows = csr_array(
+            (self.probabilities, self.successors, self.row_starts),
+            shape=(self.action_count * self.state_count, self.state_count),
+        )
+        return [rows[action * self.state_count :][: self.state_count] for action in self.actions]
+
     @property
     def _motion(self) -> tuple[Any, ...]:
         """What the kernels take of the process."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -14,9 +14,9 @@ TOLERANCE = 1e-8
 class MarkovDecisionProcess(Protocol):
     """What the method needs of an MDP without reward.
 
-    That is a discount, the fixed point of Bellman's equation and means after actions, which
-    actions do the same, which states lie in parts between which there is no way, and which lie
-    near each other.
+    That is a discount, the fixed point of Bellman's equation and means after actions, the
+    transition probabilities, which actions do the same, which states lie in parts between which
+    there is no way, and which lie near each other.
     """
 
     @property
@@ -49,6 +49,8 @@ class MarkovDecisionProcess(Protocol):
     ) -> npt.NDArray[np.float64]:
         """(U, A, L) the mean of values (S, L) after each action in each of the states (U,)."""
         ...
+
+    def transitions(self) -> list[Any]: ...
 
     def same_action(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]: ...
 
