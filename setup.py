@@ -26,6 +26,10 @@ REQUIREMENTS = [
 ]
 
 EXTRAS = {
+    # What the algorithms need that the paper compares with, and nothing else does.
+    "paper": [
+        "clarabel>=0.9",  # Quadratic programs with cones; Apache-2.0, wheels for any Python 3.
+    ],
     # The real rclpy from wheels, for machines without a ROS installation. The middleware has to be
     # named: the other two do not bring it, and rclpy does not import without one.
     "ros": [
