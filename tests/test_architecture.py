@@ -90,6 +90,12 @@ def test_imports_only_from_earlier_rooms(path: Path) -> None:
             assert ROW[there] <= ROW[here], f"{label(path)} imports {name}"
 
 
+@pytest.mark.parametrize("path", [m for m in MODULES if room_of(m) == "baselines"], ids=label)
+def test_baselines_know_nothing_of_the_method(path: Path) -> None:
+    rooms = {name.split(".")[1] for name, _ in imports_of(path) if name.startswith(PACKAGE.name)}
+    assert rooms <= {"errors", "mdp", "demonstrations", "baselines"}
+
+
 @pytest.mark.parametrize("path", [m for m in MODULES if room_of(m) != "nodes"], ids=label)
 def test_only_nodes_import_ros(path: Path) -> None:
     for name, when_loaded in imports_of(path):
