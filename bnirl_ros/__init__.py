@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from bnirl_ros.errors import InputError
     from bnirl_ros.inference.filtering import SubgoalFilter
     from bnirl_ros.inference.posterior import infer
+    from bnirl_ros.inference.prediction import predict, predict_at, predict_from_mode
     from bnirl_ros.inference.settings import Settings
     from bnirl_ros.inference.summary import summarise
     from bnirl_ros.maps import FeatureMap, GridMap, load_features, load_map, with_features
@@ -32,6 +33,9 @@ __all__ = [
     "load_features",
     "load_map",
     "place",
+    "predict",
+    "predict_at",
+    "predict_from_mode",
     "read_csv",
     "read_demonstration",
     "summarise",
@@ -49,6 +53,9 @@ _MODULE_OF = {
     "load_features": "maps",
     "load_map": "maps",
     "place": "demonstrations.placement",
+    "predict": "inference.prediction",
+    "predict_at": "inference.prediction",
+    "predict_from_mode": "inference.prediction",
     "read_csv": "demonstrations.csv_file",
     "read_demonstration": "bags.demonstration",
     "summarise": "inference.summary",

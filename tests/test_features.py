@@ -17,8 +17,9 @@ from PIL import Image
 from bnirl_ros import cli
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.errors import InputError
-from bnirl_ros.inference.filtering import SubgoalFilter, log_predictive
+from bnirl_ros.inference.filtering import SubgoalFilter
 from bnirl_ros.inference.posterior import infer, model_of
+from bnirl_ros.inference.prediction import log_predictive
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.inference.summary import summarise
 from bnirl_ros.maps import FeatureMap, GridMap, load_features, with_features

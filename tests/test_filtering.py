@@ -1,8 +1,7 @@
-"""Watching a demonstrator: the filter against the textbook's, and what it foresees."""
+"""Watching a demonstrator: the filter against the textbook's."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -15,7 +14,7 @@ from bnirl_ros.experiments.scenarios import outcome_of
 from bnirl_ros.inference.filtering import (
     SubgoalFilter,
     filtered,
-    log_predictive,
+    foreseen,
     weights_of_draws,
 )
 from bnirl_ros.inference.posterior import Posterior, grid_world, infer, pursuit_model_of
@@ -52,34 +51,38 @@ def random_weights(model: PursuitModel, seed: int) -> npt.NDArray[np.float64]:
 
 def textbook_filter(
     model: PursuitModel, weights: npt.NDArray[np.float64], parameters: Parameters
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """The forward algorithm of a hidden Markov chain, with a whole matrix of transitions."""
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """The forward algorithm of a hidden Markov chain, with a whole matrix of transitions.
+
+    Belief after each action and before it, and the evidence of the action.
+    """
     count, candidates = len(model.state_of), len(weights)
     belief, evidence = np.empty((count, candidates)), np.empty(count)
+    before = np.empty((count, candidates))
     for t, (state, action) in enumerate(zip(model.state_of, model.action_of, strict=True)):
         part = model.state_part[state]
         drawn = np.array(
             [weights[g] * (model.candidate_part[g] == part) for g in range(candidates)]
         )
         if model.starts[t]:
-            foreseen = drawn
+            before[t] = drawn
         else:
             transition = np.empty((candidates, candidates))
             for g in range(candidates):
                 rho = switch_probability(model, parameters, t, g)
                 transition[g] = rho * drawn
                 transition[g, g] += 1.0 - rho
-            foreseen = belief[t - 1] @ transition
+            before[t] = belief[t - 1] @ transition
         slip = parameters[2]
         likelihood = [
             (1.0 - slip) * explained_probability(model, parameters, state, g)[action]
             + slip * uniform_probability(model, state)[action]
             for g in range(candidates)
         ]
-        joint = foreseen * likelihood
+        joint = before[t] * likelihood
         evidence[t] = joint.sum()
         belief[t] = joint / evidence[t]
-    return belief, evidence
+    return belief, evidence, before
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -88,10 +91,14 @@ def test_filtering_is_the_textbooks(name: str) -> None:
     model = small_model(case, seed=1)
     weights = random_weights(model, seed=2)
     belief, evidence = filtered(model, weights, parameters_of(case))
-    expected_belief, expected_evidence = textbook_filter(model, weights, parameters_of(case))
+    expected_belief, expected_evidence, before = textbook_filter(
+        model, weights, parameters_of(case)
+    )
     np.testing.assert_allclose(belief, expected_belief, rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(evidence, expected_evidence, rtol=1e-9)
     np.testing.assert_allclose(belief.sum(axis=1), 1.0)
+    expected = foreseen(model, weights, parameters_of(case))
+    np.testing.assert_allclose(expected, before, rtol=1e-9, atol=1e-15)
 
 
 def test_evidence_is_that_of_all_histories() -> None:
@@ -250,61 +257,6 @@ def test_the_belief_comes_to_rest_on_the_true_subgoal(seed: int) -> None:
     assert of_true[last].min() > of_true[last[:-1] + 1].min()
 
 
-# Foreseeing
-
-
-def test_log_predictive_of_a_single_draw_is_its_evidence() -> None:
-    posterior = posterior_with(**ONE_DRAW)
-    watched, _ = walked(seed=1, episodes=2)
-    weights = weights_of_draws(posterior, model_of_draw(posterior), np.array([0]))[0]
-    model = pursuit_model_of(watched, posterior.candidates, MAP, posterior.settings)
-    _, evidence = filtered(model, weights, posterior.draws.parameters[0, 0])
-    foreseen = log_predictive(posterior, watched, MAP)
-    np.testing.assert_allclose(foreseen, np.log(evidence), rtol=1e-12)
-    # Episodes are foreseen each for itself.
-    apart = [log_predictive(posterior, episode(watched, number), MAP) for number in (0, 1)]
-    np.testing.assert_allclose(foreseen, np.concatenate(apart), rtol=1e-12)
-
-
-def test_log_predictive_is_the_mean_over_draws() -> None:
-    posterior = posterior_with(chains=2, sweeps=102, burn_in=99)
-    watched, _ = walked(seed=1, episodes=1)
-    singles = []
-    for chain in range(2):
-        for draw in range(3):
-            here = (slice(chain, chain + 1), slice(draw, draw + 1))
-            draws = replace(
-                posterior.draws,
-                **{name: values[here] for name, values in vars(posterior.draws).items()},
-            )
-            singles.append(log_predictive(replace(posterior, draws=draws), watched, MAP))
-    expected = np.log(np.exp(singles).mean(axis=0))
-    np.testing.assert_allclose(log_predictive(posterior, watched, MAP), expected, rtol=1e-12)
-
-
-@pytest.mark.parametrize("likelihood", ["delay", "value"])
-@pytest.mark.parametrize("rows", [1, 4, 12])
-def test_one_of_all_actions_comes_next(likelihood: str, rows: int) -> None:
-    posterior = posterior_with(chains=2, sweeps=60, burn_in=30, likelihood=likelihood)
-    watched = episode(walked(seed=1)[0], 0)
-    world = grid_world(MAP, posterior.settings)
-    state = world.states_of(watched.cells[rows - 1])
-    # By delay, blocked moves are staying.
-    distinct = set(
-        world.actions if likelihood == "value" else world.actions[world.same_action(state)[0]]
-    )
-    probability = []
-    for action in distinct:
-        actions = watched.action[:rows].copy()
-        actions[-1] = action
-        trial = Demonstration(
-            watched.episode[:rows], watched.cells[:rows], actions, *WITHOUT_LAST_POSES
-        )
-        probability.append(np.exp(log_predictive(posterior, trial, MAP)[-1]))
-    assert sum(probability) == pytest.approx(1.0)
-    assert min(probability) > 0.0
-
-
 # What cannot be watched
 
 
@@ -312,8 +264,6 @@ def test_only_the_sequential_model_filters() -> None:
     posterior = posterior_with(model="paper", sweeps=20, burn_in=10)
     with pytest.raises(InputError, match="only the sequential model can be filtered"):
         SubgoalFilter(posterior, MAP)
-    with pytest.raises(InputError, match="only the sequential model can be filtered"):
-        log_predictive(posterior, walked(seed=1)[0], MAP)
 
 
 ROOMS = parse_text_grid("...#.\n...#.\n...#.\n", "two rooms")

@@ -79,14 +79,6 @@ def _observation(
     if action is None or action not in ACTION_SETS[moves]:
         names = ", ".join(ACTION_NAMES[index] for index in ACTION_SETS[moves])
         raise InputError(f"{place}: action is {name!r}; it must be one of {names}")
-    if not grid_map.contains([[x, y]])[0]:
-        height, width = grid_map.free.shape
-        raise InputError(
-            f"{place}: cell ({x}, {y}) is outside the map of {width} x {height} cells; "
-            "correct it or give another map"
-        )
-    if not grid_map.free[y, x]:
-        raise InputError(
-            f"{place}: cell ({x}, {y}) is blocked on the map; correct it or give another map"
-        )
+    if fault := grid_map.fault_of((x, y)):
+        raise InputError(f"{place}: {fault}; correct it or give another map")
     return episode, x, y, action

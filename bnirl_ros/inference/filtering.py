@@ -1,4 +1,4 @@
-"""What the demonstrator is going for now, and what it will do next: filtering, draw by draw.
+"""What the demonstrator is going for now: filtering, draw by draw.
 
 Given the parameters and weights of a draw, the subgoal of a demonstrator that is being watched is
 the state of a hidden Markov chain. Filtering costs O(G) an observation.
@@ -59,6 +59,25 @@ def filtered(
     return belief, evidence
 
 
+def foreseen(
+    model: PursuitModel,
+    weights: npt.NDArray[np.float64],
+    parameters: npt.NDArray[np.float64],
+) -> npt.NDArray[np.float64]:
+    """P(subgoal at t | actions before t in its episode) (N, G): before action t is seen.
+
+    Args:
+        model, weights, parameters: as in `filtered`.
+    """
+    before = np.roll(filtered(model, weights, parameters)[0], 1, axis=0)
+    here = model.candidate_part == model.state_part[model.state_of][:, None]
+    drawn = np.where(here, weights, 0.0)
+    rho = model.switch_probabilities(parameters)
+    switched = (rho * before).sum(axis=1, keepdims=True)
+    # At a start nothing is kept, and what was before belongs to another episode.
+    return np.where(model.starts[:, None], drawn, (1.0 - rho) * before + switched * drawn)
+
+
 def weights_of_draws(
     posterior: Posterior, model: PursuitModel, draws: npt.NDArray[np.int64]
 ) -> npt.NDArray[np.float64]:
@@ -99,38 +118,38 @@ def _urn_weights(
     return np.asarray((eta * model.prior + counts) / (eta + drawn))
 
 
-def log_predictive(
-    posterior: Posterior, held_out: Demonstration, grid_map: GridMap
-) -> npt.NDArray[np.float64]:
-    """Log P(action t | actions before t in its episode) (N,) of another demonstration.
+def evenly_spaced_draws(
+    posterior: Posterior, grid_map: GridMap
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Of evenly spaced draws of all chains, the weights of the next subgoal and the parameters.
 
-    Averaged over draws of the posterior, which knows nothing of that demonstration. Actions that
-    do the same, such as blocked moves, are one action.
+    Returns:
+        (D, G) weights as in `weights_of_draws`, and (D, P) parameters in the order of `PRIORS`.
 
     Raises:
         InputError: the posterior is not one of the sequential model.
     """
-    model, numbers = _sequential(posterior, grid_map)
-    watched = pursuit_model_of(held_out, posterior.candidates, grid_map, posterior.settings)
-    parameters = posterior.draws.parameters.reshape(-1, len(PRIORS))[numbers]
-    weights = weights_of_draws(posterior, model, numbers)
-    total = np.zeros(len(held_out))
-    for values, of_draw in zip(parameters, weights, strict=True):
-        total += filtered(watched, of_draw, values)[1]
-    return np.asarray(np.log(total / len(numbers)))
-
-
-def _sequential(
-    posterior: Posterior, grid_map: GridMap
-) -> tuple[PursuitModel, npt.NDArray[np.int64]]:
-    """The model of a posterior's demonstration, and the numbers of evenly spaced draws."""
     if posterior.settings.model != "sequential":
         raise InputError("only the sequential model can be filtered; infer with it")
     model = pursuit_model_of(
         posterior.demonstration, posterior.candidates, grid_map, posterior.settings
     )
-    count = posterior.draws.log_joint.size
-    return model, np.unique(np.linspace(0, count - 1, _DRAWS).astype(np.int64))
+    numbers = np.unique(np.linspace(0, posterior.draws.log_joint.size - 1, _DRAWS).astype(int))
+    parameters = posterior.draws.parameters.reshape(-1, len(PRIORS))[numbers]
+    return weights_of_draws(posterior, model, numbers), parameters
+
+
+def middle_of_draws(
+    posterior: Posterior, grid_map: GridMap
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """(G,) mean weights of the next subgoal, and (P,) median parameters.
+
+    Raises:
+        InputError: the posterior is not one of the sequential model.
+    """
+    weights, _ = evenly_spaced_draws(posterior, grid_map)
+    parameters = np.median(posterior.draws.parameters.reshape(-1, len(PRIORS)), axis=0)
+    return weights.mean(axis=0), parameters
 
 
 class SubgoalFilter:
@@ -146,9 +165,7 @@ class SubgoalFilter:
         Raises:
             InputError: the posterior is not one of the sequential model.
         """
-        model, numbers = _sequential(posterior, grid_map)
-        self._parameters = np.median(posterior.draws.parameters.reshape(-1, len(PRIORS)), axis=0)
-        self._weights = weights_of_draws(posterior, model, numbers).mean(axis=0)
+        self._weights, self._parameters = middle_of_draws(posterior, grid_map)
         self.candidates = posterior.candidates
         self._world = grid_world(grid_map, posterior.settings)
         reachable = np.isin(

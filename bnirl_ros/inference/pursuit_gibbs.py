@@ -39,6 +39,9 @@ _HEAVY = 1e-6  # a weight above which a candidate's place matters to a relocatio
 _FARTHEST = 27.0  # logarithms and logits are not sought beyond
 _RAREST = 1e-12  # probabilities stay off 0 and 1, which would rule out what is only improbable
 
+LEAST_PROBABILITY = 1e-200
+"""Of an action that cannot be: it is only very improbable, so that a filter has something left."""
+
 # Columns of the parameters, in the order of `PRIORS`.
 ALPHA, ETA, SLIP, ON_ARRIVAL, AT_SUBGOAL, ELSEWHERE = range(len(PRIORS))
 
@@ -289,8 +292,7 @@ def softmax_table(model, alpha):  # type: ignore[no-untyped-def]
                 total += np.exp(-alpha * model.cost[state, action])
             before = state
         cost = model.cost[state, model.pair_action[pair]]
-        # What cannot be is only very improbable, so that a filter always has something left.
-        table[pair] = np.maximum(np.exp(-alpha * cost) / total, 1e-200)
+        table[pair] = np.maximum(np.exp(-alpha * cost) / total, LEAST_PROBABILITY)
     return table
 
 

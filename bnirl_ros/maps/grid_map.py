@@ -73,3 +73,11 @@ class GridMap:
         free = self.contains(cells)
         free[free] = self.free[cells[free, 1], cells[free, 0]]
         return free
+
+    def fault_of(self, cell: npt.ArrayLike) -> str | None:
+        """Words on why nobody can be in a cell (x, y): it is outside, or blocked; else None."""
+        x, y = np.asarray(cell).tolist()
+        height, width = self.free.shape
+        if not self.contains([[x, y]])[0]:
+            return f"cell ({x}, {y}) is outside the map of {width} x {height} cells"
+        return None if self.free[y, x] else f"cell ({x}, {y}) is blocked on the map"

@@ -18,8 +18,8 @@ from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.experiments.overcooked import LAYOUTS, MOVES, read_overcooked
 from bnirl_ros.experiments.study.part import MODELS, Part, settings_of
 from bnirl_ros.experiments.study.report import Table
-from bnirl_ros.inference.filtering import log_predictive
 from bnirl_ros.inference.posterior import Posterior, grid_world, infer
+from bnirl_ros.inference.prediction import log_predictive
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.maps import GridMap
 from bnirl_ros.mdp.grid_world import GridWorld
