@@ -16,6 +16,7 @@ import pytest
 
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.errors import InputError
+from bnirl_ros.experiments.overcooked import LAYOUTS
 from bnirl_ros.experiments.study import (
     cost,
     kitchens,
@@ -44,14 +45,14 @@ from bnirl_ros.experiments.study.simulated import (
     random_map,
     random_subgoals,
 )
-from bnirl_ros.inference.posterior import grid_world, infer
+from bnirl_ros.inference.posterior import grid_world
+from bnirl_ros.inference.scoring import WITHOUT_MODEL, losses
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.inference.summary import Pursuit, Subgoal, Summary, nothing_found
 from bnirl_ros.maps import GridMap
 from bnirl_ros.mdp.actions import ACTION_NAMES, STEPS
 from bnirl_ros.mdp.goal_values import goal_values
 from bnirl_ros.mdp.grid_world import GridWorld
-from bnirl_ros.model.likelihood import action_log_likelihood
 from bnirl_ros.model.pursuits import PursuitModel, pursuit_model
 
 # What is found against what is true
@@ -267,70 +268,67 @@ def in_corridor(*steps: tuple[int, int, str]) -> Demonstration:
     )
 
 
-def test_frequencies_are_those_of_outcomes() -> None:
-    learnt = in_corridor((0, 0, "E"), (0, 1, "stay"), (0, 1, "N"), (0, 1, "E"), (0, 1, "W"))
-    held_out = in_corridor((2, 0, "E"), (2, 0, "stay"), (2, 1, "S"), (2, 1, "W"))
-    world = grid_world(CORRIDOR, Settings())
-    # In each cell staying, by whatever blocked move, and the move to the other one.
-    foreseen = next_action.predict_frequency(learnt, held_out, world)
-    assert np.exp(foreseen) == pytest.approx([1.5 / 2, 0.5 / 2, 3.5 / 5, 1.5 / 5])
-    alike = next_action.predict_uniform(learnt, held_out, world)
-    assert np.exp(alike) == pytest.approx([0.5] * 4)
-    assert next_action.actions_alike(held_out, world).tolist() == [1, 8, 8, 1]
-
-
-def test_the_papers_prediction_is_the_urn_over_its_draws() -> None:
-    settings = Settings(model="paper", sweeps=30, burn_in=10, chains=2, alpha=1.0, eta=0.5)
-    learnt = in_corridor(*[(0, 0, "E"), (0, 1, "stay"), (0, 1, "W")] * 2)
-    held_out = in_corridor((2, 0, "E"), (2, 1, "W"))
-    posterior = infer(learnt, CORRIDOR, settings)
-    world = grid_world(CORRIDOR, settings)
-    values = goal_values(world, posterior.candidates.goals, [0, 1])
-    likelihood = np.exp(action_log_likelihood(values, 1.0))  # (state, action, subgoal)
-    expected = np.zeros(2)
-    drawn = posterior.draws.subgoal_of.reshape(-1, len(learnt))
-    for subgoal_of in drawn:
-        for subgoal in range(2):
-            weight = ((subgoal_of == subgoal).sum() + 0.5 / 2) / (6 + 0.5)
-            expected += weight * likelihood[[0, 1], [1, 5], subgoal] / len(drawn)
-    foreseen = next_action.predict_exchangeable(posterior, held_out, CORRIDOR, settings)
-    assert np.exp(foreseen) == pytest.approx(expected)
-
-
-def test_every_model_foresees() -> None:
-    assert list(next_action.PREDICTORS) == list(MODELS)
+def test_every_model_has_a_simulator() -> None:
     assert list(reliability.SIMULATORS) == list(MODELS)
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_all_outcomes_together_are_certain(model: str) -> None:
-    settings = Settings(model=model, sweeps=30, burn_in=10, chains=1)
-    learnt = in_corridor((0, 0, "E"), (0, 1, "stay"), (0, 1, "W"), (0, 0, "E"))
-    posterior = infer(learnt, CORRIDOR, settings)
-    # Whatever came before in the episode, and whatever else leads to the same cell.
-    for before in ([], [(2, 1, "stay")], [(2, 0, "E"), (2, 1, "N"), (2, 1, "W")]):
-        for x, outcomes in ((0, ("E", "stay")), (0, ("E", "SW")), (1, ("W", "E"))):
-            probability = 0.0
-            for name in outcomes:
-                episode = in_corridor(*before, (2, x, name))
-                predict = next_action.PREDICTORS[model]
-                foreseen = predict(posterior, episode, CORRIDOR, settings)
-                assert foreseen.shape == (len(episode),)
-                probability += np.exp(foreseen[-1])
-            assert probability == pytest.approx(1.0)
+def test_a_trials_actions_are_drawn_together() -> None:
+    loss, trial = np.array([1.0, 1.0, 1.0, 0.0, 0.0]), np.array([4, 4, 4, 9, 9])
+    mean, low, high = next_action.of_trials(loss, trial) or (-1.0, -1.0, -1.0)
+    # Drawn again are both trials, or one of them twice: a quarter of the time each.
+    assert (mean, low, high) == (0.6, 0.0, 1.0)
+    assert next_action.of_trials(np.array([1.0, np.inf]), trial[:2]) is None
 
 
-def test_what_an_episode_did_so_far_counts_for_the_sequential_model_alone() -> None:
-    learnt = in_corridor(*[(0, 0, "E"), (0, 1, "W")] * 5)
-    held_out = [in_corridor((2, 0, first), (2, 0, "E")) for first in ("E", "stay")]
-    last = {}
-    for model in MODELS:
-        settings = Settings(model=model, sweeps=60, burn_in=20, chains=1)
-        posterior = infer(learnt, CORRIDOR, settings)
-        predict = next_action.PREDICTORS[model]
-        last[model] = [predict(posterior, each, CORRIDOR, settings)[-1] for each in held_out]
-    assert last["paper"][0] == last["paper"][1]
-    assert last["sequential"][0] > last["sequential"][1] + 0.1
+TO_THE_RIGHT = ((0, "E"), (1, "stay"), (1, "stay"))
+
+
+@pytest.mark.parametrize("learner", [*MODELS, next_action.NO_MODEL])
+def test_every_learner_is_measured_on_what_it_has_not_seen(
+    learner: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    quick = dict(sweeps=30, burn_in=10, chains=1)
+    monkeypatch.setattr(
+        next_action, "settings_of", lambda model, **other: Settings(model=model, **quick, **other)
+    )
+    learnt = in_corridor(*[(number, *step) for number in range(5) for step in TO_THE_RIGHT])
+    held_out = in_corridor((2, 0, "E"), (2, 1, "W"))
+    world = grid_world(CORRIDOR, Settings(moves=4))
+    told = next_action.foreseen_by(learner, learnt, held_out, CORRIDOR)
+    for probability in told.values():
+        assert probability.shape == (2, 5)
+        np.testing.assert_allclose(probability.sum(axis=1), 1.0)
+        log = losses(probability, held_out, world).log
+        if learner != next_action.NO_MODEL:
+            assert log[0] < log[1]
+    expected = (
+        list(WITHOUT_MODEL)
+        if learner == next_action.NO_MODEL
+        else [
+            f"{learner}, predictive",
+            f"{learner}, (19)",
+        ]
+    )
+    assert list(told) == expected
+
+
+def test_the_table_has_both_losses_of_every_prediction() -> None:
+    results = [
+        {
+            "layout": layout,
+            "held_out": 10,
+            "trials": 2,
+            "loss": {
+                "one": {"log": (0.5, 0.4, 0.6), "0-1": (0.25, 0.2, 0.3)},
+                "other": {"log": None, "0-1": (0.5, 0.5, 0.5)},
+            },
+        }
+        for layout in LAYOUTS
+    ]
+    rows = next_action.table(results).rows
+    assert rows[0] == ("one", "log", *["0.500 (0.400-0.600)"] * 3)
+    assert rows[1] == ("other", "log", *["infinite"] * 3)
+    assert rows[2] == ("one", "0-1 [%]", *["25.0 (20.0-30.0)"] * 3)
 
 
 def test_players_of_a_trial_stay_together() -> None:

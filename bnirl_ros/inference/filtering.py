@@ -168,11 +168,8 @@ class SubgoalFilter:
         self._weights, self._parameters = middle_of_draws(posterior, grid_map)
         self.candidates = posterior.candidates
         self._world = grid_world(grid_map, posterior.settings)
-        reachable = np.isin(
-            self._world.parts_of(np.flatnonzero(self._world.free)),
-            self._world.parts_of(self.candidates.goals.states),
-        )
-        states = np.flatnonzero(self._world.free)[reachable]
+        free = np.flatnonzero(self._world.free)
+        states = free[self.candidates.reachable_from(self._world, free)]
         actions = self._world.actions
         every = Demonstration(
             episode=np.zeros(len(states) * len(actions), dtype=np.int64),

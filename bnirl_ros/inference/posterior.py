@@ -123,12 +123,12 @@ def pursuit_model_of(
     world = grid_world(grid_map, settings)
     states = world.states_of(demonstration.cells)
     visited = np.unique(states)
-    reachable = np.isin(world.parts_of(visited), world.parts_of(candidates.goals.states))
+    reachable = candidates.reachable_from(world, visited)
     if not reachable.all():
         x, y = world.cells_of(visited[~reachable])[0]
         raise InputError(
-            f"cell ({x}, {y}): no candidate can be reached from it, though the demonstrator was "
-            "there; give features to more cells, or other candidates"
+            f"cell ({x}, {y}): no candidate can be reached from it; give features to more cells, "
+            "or take other candidates"
         )
     radius = settings.arrival_radius / grid_map.resolution
     return pursuit_model(

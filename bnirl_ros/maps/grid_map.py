@@ -78,6 +78,6 @@ class GridMap:
         """Words on why nobody can be in a cell (x, y): it is outside, or blocked; else None."""
         x, y = np.asarray(cell).tolist()
         height, width = self.free.shape
-        if not self.contains([[x, y]])[0]:
+        if not (0 <= x < width and 0 <= y < height):
             return f"cell ({x}, {y}) is outside the map of {width} x {height} cells"
         return None if self.free[y, x] else f"cell ({x}, {y}) is blocked on the map"

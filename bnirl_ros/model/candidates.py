@@ -59,6 +59,12 @@ class Candidates:
             are_features=self.are_features,
         )
 
+    def reachable_from(
+        self, world: GridWorld, states: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.bool_]:
+        """(U,) whether any candidate lies in the same part of the map as each of the states."""
+        return np.isin(world.parts_of(states), world.parts_of(self.goals.states))
+
     def reached_in(
         self, world: GridWorld, cells: npt.NDArray[np.int64], radius: float = 0.0
     ) -> npt.NDArray[np.bool_]:

@@ -1,125 +1,35 @@
 """Which action comes next in an episode that was held out: how surely do models foresee it?
 
-What happened in the other episodes is all that is learnt. An action counts by its outcome: a move
+What happened in the other episodes is all that is learnt. An action counts by what it does: a move
 that is blocked is staying.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.experiments.overcooked import LAYOUTS, MOVES, read_overcooked
-from bnirl_ros.experiments.study.part import MODELS, Part, settings_of
+from bnirl_ros.experiments.study.intervals import ratio_interval
+from bnirl_ros.experiments.study.part import MODELS, SEED, Part, settings_of
 from bnirl_ros.experiments.study.report import Table
-from bnirl_ros.inference.posterior import Posterior, grid_world, infer
-from bnirl_ros.inference.prediction import log_predictive
+from bnirl_ros.inference.posterior import grid_world, infer
+from bnirl_ros.inference.prediction import predict, predict_from_mode
+from bnirl_ros.inference.scoring import SMOOTHING, WITHOUT_MODEL, losses
 from bnirl_ros.inference.settings import Settings
-from bnirl_ros.maps import GridMap
-from bnirl_ros.mdp.grid_world import GridWorld
-from bnirl_ros.model.mixture import subgoal_mixture
+from bnirl_ros.maps.grid_map import GridMap
 
-SMOOTHING = 0.5
-"""What is added to every count of an outcome, Jeffreys' prior."""
+PREDICTORS = {"predictive": predict, "(19)": predict_from_mode}
+"""How a posterior foresees, whichever model it is of."""
 
-
-class Predictor(Protocol):
-    """Foresees the actions of a demonstration that its posterior does not know."""
-
-    def __call__(
-        self, posterior: Posterior, held_out: Demonstration, grid_map: GridMap, settings: Settings
-    ) -> npt.NDArray[np.float64]:
-        """(N,) log P of each action's outcome given its episode so far."""
-        ...
-
-
-def predict_exchangeable(
-    posterior: Posterior, held_out: Demonstration, grid_map: GridMap, settings: Settings
-) -> npt.NDArray[np.float64]:
-    """The paper's posterior predictive: (N,) log sum_g w_g P(a | s, g).
-
-    The urn gives the next observation's subgoal: w_g = (n_g + eta P(g)) / (N + eta), the mean over
-    the draws. The held-out observations before it are left out of the counts.
-    """
-    world = grid_world(grid_map, settings)
-    mixture = subgoal_mixture(
-        world,
-        world.states_of(held_out.cells),
-        held_out.action,
-        posterior.candidates.goals,
-        **settings.fixed,
-    )
-    drawn = posterior.draws.subgoal_of.reshape(-1)
-    count = np.bincount(drawn, minlength=len(posterior.candidates)) / (
-        len(drawn) / len(posterior.demonstration)
-    )
-    prior = np.exp(mixture.log_prior)
-    weights = (count + mixture.eta * prior) / (len(posterior.demonstration) + mixture.eta)
-    of_action = np.log(np.exp(mixture.log_likelihood) @ weights)[mixture.pair_of]
-    # Actions with the same outcome are equally probable.
-    return np.asarray(of_action + np.log(actions_alike(held_out, world)))
-
-
-def predict_in_sequence(
-    posterior: Posterior, held_out: Demonstration, grid_map: GridMap, settings: Settings
-) -> npt.NDArray[np.float64]:
-    """(N,) the sequential model's prediction, to which such actions are one action."""
-    return log_predictive(posterior, held_out, grid_map)
-
-
-PREDICTORS: dict[str, Predictor] = {
-    "sequential": predict_in_sequence,
-    "paper": predict_exchangeable,
-}
-"""How each model foresees. A model that none is given for has no row."""
-
-
-def outcomes_of(demonstration: Demonstration, world: GridWorld) -> npt.NDArray[np.int64]:
-    """(N, 2) state, and the state to which its action leads when it succeeds."""
-    states = world.states_of(demonstration.cells)
-    positions = np.searchsorted(world.actions, demonstration.action)
-    return np.column_stack([states, world.outcomes()[states, positions]])
-
-
-def actions_alike(demonstration: Demonstration, world: GridWorld) -> npt.NDArray[np.int64]:
-    """(N,) how many actions of its state have the outcome of an observation's own."""
-    states, outcomes = outcomes_of(demonstration, world).T
-    return np.asarray((world.outcomes()[states] == outcomes[:, None]).sum(axis=1))
-
-
-def predict_uniform(
-    learnt: Demonstration, held_out: Demonstration, world: GridWorld
-) -> npt.NDArray[np.float64]:
-    """(N,) log P of each outcome where all those of its state are equally probable."""
-    possible = [len(set(row)) for row in world.outcomes()[world.states_of(held_out.cells)]]
-    return -np.log(possible)
-
-
-def predict_frequency(
-    learnt: Demonstration, held_out: Demonstration, world: GridWorld
-) -> npt.NDArray[np.float64]:
-    """(N,) log P of each outcome by how often it was seen in its state, `SMOOTHING` added."""
-    seen = np.zeros((world.state_count, world.state_count))
-    np.add.at(seen, tuple(outcomes_of(learnt, world).T), 1.0)
-    states, outcomes = outcomes_of(held_out, world).T
-    possible = np.exp(-predict_uniform(learnt, held_out, world))
-    share = (seen[states, outcomes] + SMOOTHING) / (
-        seen[states].sum(axis=1) + SMOOTHING * possible
-    )
-    return np.asarray(np.log(share))
-
-
-BASELINES: dict[str, Callable[..., npt.NDArray[np.float64]]] = {
-    "all outcomes alike": predict_uniform,
-    "frequency in the state": predict_frequency,
-}
-"""Predictions that need no model."""
+NO_MODEL = "no model"
+"""What learns nothing, or counts."""
 
 
 def split_trials(demonstration: Demonstration) -> tuple[Demonstration, Demonstration]:
@@ -136,66 +46,112 @@ def split_trials(demonstration: Demonstration) -> tuple[Demonstration, Demonstra
 
 @dataclass(frozen=True)
 class Case:
-    """A prediction for a layout: by a model or by one of `BASELINES`."""
+    """The predictions for a layout that come from one inference, or from none (`NO_MODEL`)."""
 
     recordings: Path
     layout: str
-    by: str
+    learner: str
+
+
+def foreseen_by(
+    learner: str, learnt: Demonstration, held_out: Demonstration, grid_map: GridMap
+) -> dict[str, npt.NDArray[np.float64]]:
+    """(N, A) what each prediction of a learner says of the actions that were held out."""
+    if learner == NO_MODEL:
+        world = grid_world(grid_map, Settings(moves=MOVES))
+        return {
+            name: prediction(learnt, held_out, world) for name, prediction in WITHOUT_MODEL.items()
+        }
+    posterior = infer(learnt, grid_map, settings_of(learner, moves=MOVES))
+    return {
+        f"{learner}, {name}": predictor(posterior, held_out, grid_map).probability
+        for name, predictor in PREDICTORS.items()
+    }
 
 
 def run(case: Case) -> dict[str, Any]:
-    """The mean log loss of the outcomes in the held-out trials [nats]."""
+    """The mean losses of the actions in the held-out trials, with intervals over the trials."""
     demonstration, grid_map = read_overcooked(case.recordings, case.layout)
     learnt, held_out = split_trials(demonstration)
-    if case.by in BASELINES:
-        world = grid_world(grid_map, Settings(moves=MOVES))
-        foreseen = BASELINES[case.by](learnt, held_out, world)
-    else:
-        settings = settings_of(case.by, moves=MOVES)
-        posterior = infer(learnt, grid_map, settings)
-        foreseen = PREDICTORS[case.by](posterior, held_out, grid_map, settings)
+    world = grid_world(grid_map, Settings(moves=MOVES))
+    trial = held_out.episode // 2
+    foreseen = foreseen_by(case.learner, learnt, held_out, grid_map)
+    lost = {by: losses(values, held_out, world) for by, values in foreseen.items()}
     return {
         "layout": case.layout,
-        "by": case.by,
         "learnt": len(learnt),
         "held_out": len(held_out),
-        "log_loss": float(-foreseen.mean()),
-        "log_loss_of_trial": {
-            int(trial): float(-foreseen[held_out.episode // 2 == trial].mean())
-            for trial in np.unique(held_out.episode // 2)
+        "trials": len(np.unique(trial)),
+        "loss": {
+            by: {"log": of_trials(each.log, trial), "0-1": of_trials(each.zero_one, trial)}
+            for by, each in lost.items()
         },
     }
 
 
+def of_trials(
+    loss: npt.NDArray[np.float64], trial: npt.NDArray[np.int64]
+) -> tuple[float, float, float] | None:
+    """Mean loss of an action, and its 95 % interval; None where it is infinite.
+
+    Trials are what is drawn again, since the actions of one are no trials of their own.
+    """
+    if not np.isfinite(loss).all():
+        return None
+    _, number = np.unique(trial, return_inverse=True)
+    counts = np.bincount(number)
+    generator = np.random.default_rng(SEED)
+    interval = ratio_interval(np.bincount(number, weights=loss), counts, generator)
+    return float(loss.mean()), *interval
+
+
 def table(results: Sequence[dict[str, Any]]) -> Table:
-    """A row for each prediction, a column for each layout."""
-    loss = {(result["by"], result["layout"]): result["log_loss"] for result in results}
-    held_out = {result["layout"]: result["held_out"] for result in results}
-    counts = ", ".join(f"{held_out[layout]:,} in `{layout}`" for layout in LAYOUTS)
+    """A row for each prediction, two columns for each layout."""
+    loss = {
+        (by, result["layout"]): lost for result in results for by, lost in result["loss"].items()
+    }
+    size = {result["layout"]: (result["held_out"], result["trials"]) for result in results}
+    counts = ", ".join(
+        f"{size[layout][0]:,} of {size[layout][1]} trials in `{layout}`" for layout in LAYOUTS
+    )
     return Table(
         title="The next action of people that were not seen before",
-        text="Mean log loss of the next action in human play, in nats: less is better. Learnt "
-        f"from every second trial, measured on the actions of the others ({counts}). An action "
-        "counts by the cell that it leads to, so a blocked move is staying. Frequencies are those "
-        f"of the outcome in its state, each with {SMOOTHING} added.",
-        header=("foreseen by", *(f"`{layout}`" for layout in LAYOUTS)),
+        text="Mean losses of the next action in human play, with 95 % intervals (bootstrap over "
+        "trials): less is better. Above the log loss in nats, below the 0-1 loss, the share of "
+        "actions that were not the most probable one, in per cent. Learnt from every second "
+        f"trial, measured on the actions of the others ({counts}). An action counts by the cell "
+        "that it leads to, so a blocked move is staying. Predictive: the posterior predictive; "
+        "(19): the policy of the most likely subgoal. Frequencies are those of what was done in "
+        f"the cell, each with {SMOOTHING} added. Of equally probable actions one is taken by "
+        "chance. To always stay loses without bound, whenever somebody moves.",
+        header=("foreseen by", "loss", *(f"`{layout}`" for layout in LAYOUTS)),
         rows=tuple(
-            (by, *(f"{loss[by, layout]:.3f}" for layout in LAYOUTS))
+            (by, name, *(_cell(loss[by, layout][kind], scale) for layout in LAYOUTS))
+            for kind, name, scale in (("log", "log", 1), ("0-1", "0-1 [%]", 100))
             for by in dict.fromkeys(by for by, _ in loss)
         ),
     )
 
 
+def _cell(values: tuple[float, float, float] | None, scale: int) -> str:
+    """A mean with its interval, in per cent where that is the scale."""
+    if values is None:
+        return "infinite"
+    mean, low, high = (f"{scale * value:.{1 if scale > 1 else 3}f}" for value in values)
+    return f"{mean} ({low}-{high})"
+
+
 def cases(recordings: Path) -> Sequence[Case]:
-    """Every prediction for every layout.
+    """Every learner for every layout.
 
     Raises:
         InputError: the recordings are missing.
     """
     for layout in LAYOUTS:
         read_overcooked(recordings, layout)
-    models = [model for model in MODELS if model in PREDICTORS]
-    return [Case(recordings, layout, by) for by in (*BASELINES, *models) for layout in LAYOUTS]
+    return [
+        Case(recordings, layout, learner) for learner in (*MODELS, NO_MODEL) for layout in LAYOUTS
+    ]
 
 
 PART = Part(name="next-action", cases=cases, run=run, table=table)
