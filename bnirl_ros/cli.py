@@ -17,9 +17,15 @@ from bnirl_ros import __version__
 from bnirl_ros.errors import InputError
 
 if TYPE_CHECKING:  # what a command needs is imported when it runs, so that --help is quick
+    import numpy as np
+    import numpy.typing as npt
+
     from bnirl_ros.demonstrations.demonstration import Demonstration
+    from bnirl_ros.inference.posterior import Posterior
+    from bnirl_ros.inference.scoring import Losses
     from bnirl_ros.inference.settings import Settings
     from bnirl_ros.maps.grid_map import GridMap
+    from bnirl_ros.views.predictions import Foreseen
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -54,41 +60,38 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"bnirl {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    from bnirl_ros.demonstrations.placement import EPISODE_GAP
-    from bnirl_ros.inference.settings import above_zero
-
     infer = commands.add_parser("infer", help="infer the subgoals of a recorded demonstration")
-    infer.add_argument(
-        "demonstration", metavar="DEMO", type=Path, help="rosbag2 folder, .mcap file or .csv"
+    _add_inference(infer)
+    infer.set_defaults(run=_infer, command=infer)
+
+    predict = commands.add_parser(
+        "predict",
+        help="foresee the actions of a demonstrator like the recorded one",
+        description="Infer the subgoals of a recorded demonstration, and foresee with them: each "
+        "action of others, given its episode so far, or what is done first by who begins in a "
+        "cell.",
     )
-    infer.add_argument(
-        "--map", type=Path, help="Nav2 map .yaml or text grid .txt; wins over a map in the bag"
-    )
-    infer.add_argument(
-        "--features",
-        type=Path,
-        help="labels (Nav2-style .yaml, .txt) or places (.yaml) of the map's cells: infer feature "
-        "subgoals",
-    )
-    infer.add_argument(
-        "--out", type=Path, default=Path("bnirl_out"), help="folder for the results (%(default)s)"
-    )
-    infer.add_argument(
-        "--remap",
+    _add_inference(predict)
+    foreseen = predict.add_mutually_exclusive_group()
+    foreseen.add_argument(
+        "--held-out",
         action="append",
         default=[],
-        metavar="a:=b",
-        help="read the topic a (pose, action or map) from the recorded topic b",
+        type=Path,
+        metavar="OTHER",
+        help="a demonstration on the same map (rosbag2 folder, .mcap or .csv), to foresee action "
+        "by action and to measure how well; may be given several times",
     )
-    _add_settings(infer)
-    infer.add_argument(
-        "--episode-gap",
-        type=above_zero,
-        default=EPISODE_GAP,
-        metavar="SECONDS",
-        help="longest time between two poses of one episode (%(default)s)",
+    foreseen.add_argument(
+        "--cell",
+        action="append",
+        default=[],
+        type=_cell,
+        metavar="x,y",
+        help="a cell to begin in; may be given several times (all visited cells; all free ones "
+        "with --candidates free)",
     )
-    infer.set_defaults(run=_infer, command=infer)
+    predict.set_defaults(run=_predict, command=predict)
 
     commands.add_parser("replay", help="play a recorded demonstration onto its topics")
 
@@ -99,6 +102,54 @@ def _parser() -> argparse.ArgumentParser:
     )
     demo.set_defaults(run=_demo)
     return parser
+
+
+def _add_inference(parser: argparse.ArgumentParser) -> None:
+    """What is inferred from, and every option of an inference."""
+    from bnirl_ros.demonstrations.placement import EPISODE_GAP
+    from bnirl_ros.inference.settings import above_zero
+
+    parser.add_argument(
+        "demonstration", metavar="DEMO", type=Path, help="rosbag2 folder, .mcap file or .csv"
+    )
+    parser.add_argument(
+        "--map", type=Path, help="Nav2 map .yaml or text grid .txt; wins over a map in the bag"
+    )
+    parser.add_argument(
+        "--features",
+        type=Path,
+        help="labels (Nav2-style .yaml, .txt) or places (.yaml) of the map's cells: infer feature "
+        "subgoals",
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("bnirl_out"), help="folder for the results (%(default)s)"
+    )
+    parser.add_argument(
+        "--remap",
+        action="append",
+        default=[],
+        metavar="a:=b",
+        help="read the topic a (pose, action or map) from the recorded topic b",
+    )
+    _add_settings(parser)
+    parser.add_argument(
+        "--episode-gap",
+        type=above_zero,
+        default=EPISODE_GAP,
+        metavar="SECONDS",
+        help="longest time between two poses of one episode (%(default)s)",
+    )
+
+
+def _cell(text: str) -> tuple[int, int]:
+    """A cell `x,y` from the command line."""
+    try:
+        x, y = map(int, text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"must be x,y, two whole numbers such as 3,1, not {text!r}"
+        ) from None
+    return x, y
 
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
@@ -148,7 +199,6 @@ def _infer(options: argparse.Namespace) -> int:
     settings = _settings(options.command, options)
     remappings = _remappings(options.command, options.remap)
 
-    from bnirl_ros.inference.posterior import infer
     from bnirl_ros.inference.summary import summarise
     from bnirl_ros.views.plot import import_matplotlib
     from bnirl_ros.views.results import check_writable, write_results
@@ -157,13 +207,129 @@ def _infer(options: argparse.Namespace) -> int:
     demonstration, grid_map, damage = _read(options, settings, remappings)
     check_writable(options.out)
     Thread(target=import_matplotlib, daemon=True).start()  # while the chains leave the GIL alone
-    with ExitStack() as stack:
-        progress = _progress(stack, settings.sweeps * settings.chains)
-        posterior = infer(demonstration, grid_map, settings, progress)
+    posterior = _inferred(demonstration, grid_map, settings)
     summary = summarise(posterior, grid_map)
     written = write_results(options.out, posterior, summary, grid_map, settings)
     print(report(summary))
     print(f"Written: {', '.join(str(file) for file in written)}")
+    return _told_of(damage)
+
+
+def _predict(options: argparse.Namespace) -> int:
+    """`bnirl predict`: from a file to predictions.csv and a table."""
+    settings = _settings(options.command, options)
+    remappings = _remappings(options.command, options.remap)
+
+    from bnirl_ros.inference.prediction import beginning_in
+    from bnirl_ros.inference.summary import summarise
+    from bnirl_ros.views.predictions import cell_table, loss_table, write_predictions
+    from bnirl_ros.views.results import check_writable
+    from bnirl_ros.views.tables import convergence
+
+    demonstration, grid_map, damage = _read(options, settings, remappings)
+    for cell in options.cell:
+        if fault := grid_map.fault_of(cell):
+            raise InputError(f"--cell: {fault}; choose a free one")
+    others = []
+    for path in options.held_out:
+        if path.resolve() == options.demonstration.resolve():
+            _warn(f"{path}: is what was learnt from; how well it is foreseen tells little")
+        held_out, _, also_damaged = _placed(path, grid_map, options, settings, remappings)
+        others.append((str(path), held_out))
+        damage = damage or also_damaged
+    check_writable(options.out)
+    posterior = _inferred(demonstration, grid_map, settings)
+    if not others:
+        cells = options.cell or _places_to_begin(posterior, grid_map)
+        others = [("", beginning_in(cells))]
+    everything = [_foreseen(posterior, *other, grid_map) for other in others]
+    written = write_predictions(options.out, everything, posterior.candidates)
+    if options.held_out:
+        print(loss_table(_losses(posterior, everything, grid_map)))
+        print(_how_much(everything))
+    else:
+        print(cell_table(everything[0], posterior.candidates, grid_map))
+    print(f"learnt from {convergence(summarise(posterior, grid_map))}")
+    print(f"Written: {', '.join(str(file) for file in written)}")
+    return _told_of(damage)
+
+
+def _foreseen(
+    posterior: Posterior, source: str, demonstration: Demonstration, grid_map: GridMap
+) -> Foreseen:
+    from bnirl_ros.inference.prediction import predict
+    from bnirl_ros.views.predictions import Foreseen
+
+    try:
+        return Foreseen(source, demonstration, predict(posterior, demonstration, grid_map))
+    except InputError as error:
+        raise InputError(f"{source or '--cell'}: {error}") from None
+
+
+def _places_to_begin(posterior: Posterior, grid_map: GridMap) -> npt.NDArray[np.int64]:
+    """(U, 2) the visited cells, or the free ones where these are candidates."""
+    import numpy as np
+
+    from bnirl_ros.inference.posterior import grid_world
+
+    world = grid_world(grid_map, posterior.settings)
+    visited = posterior.demonstration.cells, posterior.demonstration.last_cells
+    states = np.unique(world.states_of(np.concatenate(visited)))
+    if posterior.settings.candidates == "free":
+        states = np.flatnonzero(world.free)
+    # Cells without features may be in a part of the map that has no candidate.
+    return world.cells_of(states[posterior.candidates.reachable_from(world, states)])
+
+
+def _losses(
+    posterior: Posterior, everything: Sequence[Foreseen], grid_map: GridMap
+) -> dict[str, Losses]:
+    """What each prediction loses at all that was held out, by its name."""
+    import numpy as np
+
+    from bnirl_ros.inference.posterior import grid_world
+    from bnirl_ros.inference.prediction import predict_from_mode
+    from bnirl_ros.inference.scoring import WITHOUT_MODEL, Losses, losses
+
+    world = grid_world(grid_map, posterior.settings)
+    lost: dict[str, list[Losses]] = {}
+    for each in everything:
+        other = each.demonstration
+        foreseen = {
+            "predictive": each.prediction.probability,
+            "likeliest subgoal (19)": predict_from_mode(posterior, other, grid_map).probability,
+        }
+        for name, prediction in WITHOUT_MODEL.items():
+            foreseen[name] = prediction(posterior.demonstration, other, world)
+        for name, probability in foreseen.items():
+            lost.setdefault(name, []).append(losses(probability, other, world))
+    return {
+        name: Losses(
+            log=np.concatenate([part.log for part in parts]),
+            zero_one=np.concatenate([part.zero_one for part in parts]),
+        )
+        for name, parts in lost.items()
+    }
+
+
+def _how_much(everything: Sequence[Foreseen]) -> str:
+    """One line on what was held out."""
+    actions = sum(len(each.demonstration) for each in everything)
+    episodes = sum(int(each.demonstration.starts.sum()) for each in everything)
+    return f"{actions} actions in {episodes} episodes held out; a blocked move counts as staying"
+
+
+def _inferred(demonstration: Demonstration, grid_map: GridMap, settings: Settings) -> Posterior:
+    """The posterior, with a progress bar on the way."""
+    from bnirl_ros.inference.posterior import infer
+
+    with ExitStack() as stack:
+        progress = _progress(stack, settings.sweeps * settings.chains)
+        return infer(demonstration, grid_map, settings, progress)
+
+
+def _told_of(damage: str | None) -> int:
+    """Exit status 0, unless a file was damaged, which is told last."""
     if damage:
         raise InputError(f"{damage}; the results are from what could be read")
     return 0
@@ -198,16 +364,30 @@ def _read(
     from bnirl_ros.maps import load_features, load_map, with_features
 
     path: Path = options.demonstration
-    command: argparse.ArgumentParser = options.command
     given_map = load_map(options.map) if options.map else None
     features = load_features(options.features) if options.features else None
-    if path.suffix.lower() == ".csv":
+    if given_map is None and _is_csv(path):
+        options.command.error(f"{path}: a CSV file tells no map; give one with --map")
+    demonstration, grid_map, damage = _placed(path, given_map, options, settings, remappings)
+    return demonstration, with_features(grid_map, features) if features else grid_map, damage
+
+
+def _is_csv(path: Path) -> bool:
+    return path.suffix.lower() == ".csv"
+
+
+def _placed(
+    path: Path,
+    given_map: GridMap | None,
+    options: argparse.Namespace,
+    settings: Settings,
+    remappings: Mapping[str, str],
+) -> tuple[Demonstration, GridMap, str | None]:
+    """A demonstration on a given map, or the bag's own; the map; and a sentence on damage."""
+    if given_map is not None and _is_csv(path):
         from bnirl_ros.demonstrations.csv_file import read_csv
 
-        if given_map is None:
-            command.error(f"{path}: a CSV file tells no map; give one with --map")
-        demonstration = read_csv(path, given_map, settings.moves)
-        return demonstration, with_features(given_map, features) if features else given_map, None
+        return read_csv(path, given_map, settings.moves), given_map, None
 
     from bnirl_ros.bags.demonstration import read_demonstration
     from bnirl_ros.demonstrations.placement import place
@@ -227,8 +407,6 @@ def _read(
             f"{path}: {recorded.damage or 'no pose and action of equal stamps lie on the map'}; "
             "check its topics, their frame and the map"
         )
-    if features:
-        grid_map = with_features(grid_map, features)
     return placement.demonstration, grid_map, recorded.damage
 
 

@@ -1,4 +1,7 @@
-"""The command `bnirl infer` as its users meet it: what it reads, writes, says, and ends with."""
+"""The commands `bnirl infer` and `bnirl predict` as their users meet them.
+
+What they read, write, say, and end with.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import csv
 import gc
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -22,11 +26,15 @@ import bnirl_ros
 from bnirl_ros import cli
 from bnirl_ros.bags import writer as bag_writer
 from bnirl_ros.bags.demonstration import read_demonstration
+from bnirl_ros.demonstrations.csv_file import read_csv
 from bnirl_ros.demonstrations.placement import place
 from bnirl_ros.experiments.scenarios import PAPER_LOOP, shipped_demonstration
+from bnirl_ros.inference.posterior import grid_world, infer
+from bnirl_ros.inference.prediction import predict, predict_at, predict_from_mode
+from bnirl_ros.inference.scoring import WITHOUT_MODEL, losses
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.maps import GridMap, occupancy_of, parse_text_grid
-from bnirl_ros.mdp.actions import ACTION_NAMES
+from bnirl_ros.mdp.actions import ACTION_NAMES, ACTION_SETS
 from bnirl_ros.model.pursuits import PRIORS
 from demonstration_support import (
     BAD_COUNTS,
@@ -860,6 +868,250 @@ def test_a_reader_that_has_had_enough_is_no_fault(tmp_path: Path) -> None:
     end = ended(process)
     assert (end.status, end.err) == (1, "")
     assert sorted(path.name for path in tmp_path.iterdir()) == FILES
+
+
+# Foreseeing
+
+FEW = (*QUICK, "--chains", "2")
+FEW_SETTINGS = dict(sweeps=60, burn_in=20, chains=2)
+
+
+def foreseen_in(folder: Path) -> list[dict[str, str]]:
+    with (folder / "predictions.csv").open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def probabilities_in(rows: list[dict[str, str]], moves: int = 8) -> np.ndarray:
+    names = [ACTION_NAMES[action] for action in ACTION_SETS[moves]]
+    return np.array([[float(row[name]) for name in names] for row in rows])
+
+
+@pytest.fixture
+def rounds(tmp_path: Path) -> Path:
+    """Three rounds to learn from."""
+    return write_bag(tmp_path / "rounds", [map_of_grid(), *walk(rounds=3)])
+
+
+@pytest.fixture
+def other(tmp_path: Path) -> Path:
+    """Two shorter walks of somebody else, one of them against a wall."""
+    rows = [(0, x, 0, "E") for x in range(6)] + [(0, 6, y, "N") for y in range(6)]
+    rows += [(4, 6, 6, "W"), (4, 5, 6, "W"), (4, 4, 6, "N")]
+    observed = [(episode, x, y, ACTION_NAMES.index(name)) for episode, x, y, name in rows]
+    return write_csv(tmp_path / "other.csv", np.array(observed))
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_what_was_held_out_is_foreseen_and_scored(
+    bnirl: Command, rounds: Path, other: Path, tmp_path: Path, model: str
+) -> None:
+    options = ("--held-out", other, "--model", model, "--out", tmp_path / "out", *FEW)
+    end = bnirl("predict", rounds, *options)
+    assert (end.status, end.err) == (0, "")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["predictions.csv"]
+    assert str(tmp_path / "out" / "predictions.csv") in end.out
+
+    # All of it as from Python.
+    settings = Settings(model=model, **FEW_SETTINGS)
+    learnt = place(read_demonstration(rounds, {}).recording, MAP).demonstration
+    held_out = read_csv(other, MAP)
+    posterior = infer(learnt, MAP, settings)
+    told = predict(posterior, held_out, MAP)
+    rows = foreseen_in(tmp_path / "out")
+    ends = ["foreseen", "subgoal_x", "subgoal_y", "subgoal_probability"]
+    assert list(rows[0]) == ["held_out", "episode", "x", "y", "action", *ACTION_NAMES, *ends]
+    assert {row["held_out"] for row in rows} == {str(other)}
+    observed = [
+        [int(row["episode"]), int(row["x"]), int(row["y"]), ACTION_NAMES.index(row["action"])]
+        for row in rows
+    ]
+    np.testing.assert_array_equal(observed, held_out.observations)
+    np.testing.assert_allclose(probabilities_in(rows), told.probability, atol=1e-6)
+    np.testing.assert_allclose(probabilities_in(rows).sum(axis=1), 1.0, atol=1e-5)
+    names = [ACTION_NAMES[action] for action in told.most_probable]
+    assert [row["foreseen"] for row in rows] == names
+    cells = [[int(row["subgoal_x"]), int(row["subgoal_y"])] for row in rows]
+    np.testing.assert_array_equal(cells, posterior.candidates.coordinates[told.subgoal])
+    shares = [float(row["subgoal_probability"]) for row in rows]
+    np.testing.assert_allclose(shares, told.subgoal_probability, atol=1e-6)
+
+    world = grid_world(MAP, settings)
+    mode = predict_from_mode(posterior, held_out, MAP)
+    expected = {"predictive": told.probability, "likeliest subgoal (19)": mode.probability}
+    for name, prediction in WITHOUT_MODEL.items():
+        expected[name] = prediction(learnt, held_out, world)
+    lines = [line.rsplit(maxsplit=2) for line in end.out.splitlines()[1 : 1 + len(expected)]]
+    scored = {name.strip(): (log, zero_one) for name, log, zero_one in lines}
+    for name, probability in expected.items():
+        lost = losses(probability, held_out, world)
+        assert scored[name] == (f"{lost.log.mean():.3f}", f"{lost.zero_one.mean():.3f}")
+    assert scored["always stay"][0] == "inf"
+    assert "15 actions in 2 episodes held out" in end.out
+
+
+def test_of_several_files_each_is_foreseen_for_itself(
+    bnirl: Command, rounds: Path, other: Path, tmp_path: Path
+) -> None:
+    once = bnirl("predict", rounds, "--held-out", other, "--out", tmp_path / "once", *FEW)
+    files = ("--held-out", other, "--held-out", write_bag(tmp_path / "b", walk()))
+    end = bnirl("predict", rounds, *files, "--out", tmp_path / "both", *FEW)
+    assert (once.status, end.status) == (0, 0)
+    rows = foreseen_in(tmp_path / "both")
+    assert rows[:15] == foreseen_in(tmp_path / "once")
+    assert {row["held_out"] for row in rows[15:]} == {str(tmp_path / "b")}
+    assert len(rows) == 15 + OBSERVATIONS_OF_WALK
+    assert f"{len(rows)} actions in 3 episodes held out" in end.out
+
+
+def test_who_begins_in_a_cell_is_foreseen(bnirl: Command, rounds: Path, tmp_path: Path) -> None:
+    end = bnirl("predict", rounds, "--out", tmp_path / "visited", *FEW)
+    assert (end.status, end.err) == (0, "")
+    rows = foreseen_in(tmp_path / "visited")
+    learnt = place(read_demonstration(rounds, {}).recording, MAP).demonstration
+    visited = {tuple(cell) for cell in learnt.cells.tolist()}
+    assert [(int(row["x"]), int(row["y"])) for row in rows] == sorted(
+        visited, key=lambda cell: (cell[1], cell[0])
+    )
+    assert all(row["held_out"] == row["episode"] == row["action"] == "" for row in rows)
+    told = predict_at(infer(learnt, MAP, Settings(**FEW_SETTINGS)), [(0, 0), (6, 3)], MAP)
+    options = ("--cell", "0,0", "--cell", "6,3", "--out", tmp_path / "two")
+    end = bnirl("predict", rounds, *options, *FEW)
+    assert end.status == 0
+    two = foreseen_in(tmp_path / "two")
+    np.testing.assert_allclose(probabilities_in(two), told.probability, atol=1e-6)
+    assert two == [row for row in rows if (row["x"], row["y"]) in (("0", "0"), ("6", "3"))]
+    assert "(0, 0)" in end.out
+    assert "(6, 3)" in end.out
+    # On the terminal, what is likeliest comes first, with all that do the same.
+    best = np.argmax(told.probability[1])
+    assert f"{ACTION_NAMES[best]} {told.probability[1, best]:.2f}, " in end.out.splitlines()[2]
+
+
+def test_of_many_cells_the_terminal_shows_the_first_ones(
+    bnirl: Command, rounds: Path, tmp_path: Path
+) -> None:
+    end = bnirl("predict", rounds, "--candidates", "free", "--out", tmp_path, *FEW)
+    assert end.status == 0
+    assert len(foreseen_in(tmp_path)) == MAP.free.sum() == 48
+    assert end.out.splitlines()[21] == "and 28 cells more"
+    assert len(end.out.splitlines()) == 24
+
+
+def test_with_four_moves_five_actions_are_foreseen(
+    bnirl: Command, other: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "map.txt").write_text(GRID)
+    options = ("--map", tmp_path / "map.txt", "--moves", "4", "--out", tmp_path, *FEW)
+    assert bnirl("predict", other, *options).status == 0
+    rows = foreseen_in(tmp_path)
+    assert list(rows[0])[5:10] == ["stay", "E", "N", "W", "S"]
+    assert list(rows[0])[10] == "foreseen"
+    np.testing.assert_allclose(probabilities_in(rows, 4).sum(axis=1), 1.0, atol=1e-5)
+
+
+def test_feature_subgoals_are_foreseen_with(
+    bnirl: Command, rounds: Path, other: Path, tmp_path: Path
+) -> None:
+    rooms = tmp_path / "rooms.txt"
+    rooms.write_text("\n".join([*["4 4 4 0 3 3 3"] * 3, *["1 1 1 0 2 2 2"] * 4]) + "\n")
+    options = ("--features", rooms, "--held-out", other, "--out", tmp_path, *FEW)
+    end = bnirl("predict", rounds, *options)
+    assert (end.status, end.err) == (0, "")
+    rows = foreseen_in(tmp_path)
+    assert list(rows[0])[-2:] == ["subgoal_feature", "subgoal_probability"]
+    assert {row["subgoal_feature"] for row in rows} <= {"0", "1", "2", "3", "4"}
+    assert bnirl("predict", rounds, "--features", rooms, "--out", tmp_path, *FEW).status == 0
+
+
+def test_what_was_learnt_from_is_no_measure(bnirl: Command, rounds: Path, tmp_path: Path) -> None:
+    end = bnirl("predict", rounds, "--held-out", rounds, "--out", tmp_path, *FEW)
+    assert end.status == 0
+    assert end.lines == [
+        f"bnirl: {rounds}: is what was learnt from; how well it is foreseen tells little"
+    ]
+
+
+def test_what_cannot_be_foreseen_is_refused(
+    bnirl: Command, rounds: Path, other: Path, tmp_path: Path
+) -> None:
+    none, out = tmp_path / "none", ("--out", tmp_path / "out", *FEW)
+    assert_refused(bnirl("predict", none, *out), f"{none}: does not exist")
+    for path in (none, tmp_path / "none.csv"):
+        assert_refused(bnirl("predict", rounds, "--held-out", path, *out), str(path))
+    outside = write_csv(tmp_path / "outside.csv", np.array([(0, 0, 0, 1), (0, 9, 0, 1)]))
+    assert_refused(
+        bnirl("predict", rounds, "--held-out", other, "--held-out", outside, *out),
+        f"{outside}, line 3: cell (9, 0) is outside the map of 7 x 7 cells",
+    )
+    for cell, words in (("3,3", "is blocked"), ("7,0", "is outside"), (f"{10**30},0", "outside")):
+        assert_refused(bnirl("predict", rounds, "--cell", cell, *out), "--cell: cell (", words)
+    (tmp_path / "file").touch()
+    assert_refused(
+        bnirl("predict", rounds, "--out", tmp_path / "file", *FEW), "cannot be written there"
+    )
+    far = write_bag(tmp_path / "far", [pose_at(99.5, 0.5, START), action_of(1.0, 0.0, START)])
+    end = bnirl("predict", rounds, "--held-out", far, *out)
+    assert end.status == 1
+    assert end.lines[0] == f"bnirl: {far}: left out 1 x pose outside the map"
+    assert f"{far}: no pose and action of equal stamps lie on the map" in end.lines[1]
+    assert not (tmp_path / "out").exists()
+
+
+def test_where_no_subgoal_can_be_reached_nothing_is_foreseen(
+    bnirl: Command, tmp_path: Path
+) -> None:
+    (tmp_path / "map.txt").write_text("...#.\n")
+    learnt = write_csv(tmp_path / "demo.csv", np.array([(0, 0, 0, 1), (0, 1, 0, 1)]))
+    held_out = write_csv(tmp_path / "other.csv", np.array([(0, 4, 0, 0)]))
+    options = ("--map", tmp_path / "map.txt", "--out", tmp_path, *FEW)
+    words = "cell (4, 0): no candidate can be reached from it"
+    end = bnirl("predict", learnt, "--held-out", held_out, *options)
+    assert_refused(end, f"{held_out}: {words}")
+    assert_refused(bnirl("predict", learnt, "--cell", "4,0", *options), f"--cell: {words}")
+    assert bnirl("predict", learnt, "--cell", "2,0", *options).status == 0
+
+
+def test_of_a_truncated_bag_what_can_be_read_is_foreseen(
+    bnirl: Command, rounds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bag_writer, "CHUNK_SIZE", 2048)
+    whole = write_bag(tmp_path / "whole", [map_of_grid(), *walk(rounds=3)])
+    cut = truncated(whole, tmp_path / "cut.mcap", share=0.5)
+    end = bnirl("predict", rounds, "--held-out", cut, "--out", tmp_path, *FEW)
+    assert end.status == 1
+    assert end.lines[-1].startswith(f"bnirl: {cut}: is damaged at byte ")
+    assert "the results are from what could be read" in end.lines[-1]
+    assert OBSERVATIONS_OF_WALK < len(foreseen_in(tmp_path)) < 3 * OBSERVATIONS_OF_WALK
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--cell", "3"], "argument --cell: must be x,y, two whole numbers such as 3,1, not '3'"),
+        (["--cell", "a,b"], "must be x,y"),
+        (["--cell", "1,2,3"], "must be x,y"),
+        (["--cell", "1.5,2"], "must be x,y"),
+        (["--cell", "0,0", "--held-out", "b"], "not allowed with argument"),
+        (["--alpha", "0"], "alpha must be above 0, not 0"),
+        (["--remap", "poses:=/pose"], "--remap poses:=/pose: must be one of"),
+    ],
+)
+def test_wrong_arguments_of_predict_end_with_status_2(
+    bnirl: Command, arguments: list[str], words: str
+) -> None:
+    end = bnirl("predict", PAPER_BAG, *arguments)
+    assert (end.status, end.out) == (2, "")
+    assert end.lines[-1].startswith("bnirl predict: error: ")
+    assert words in end.lines[-1]
+
+
+def test_predict_has_every_option_of_infer(bnirl: Command) -> None:
+    told = {
+        command: set(re.findall(r"^  (--[a-z-]+)", bnirl(command, "--help").out, re.MULTILINE))
+        for command in ("infer", "predict")
+    }
+    assert told["predict"] - told["infer"] == {"--held-out", "--cell"}
+    assert told["infer"] < told["predict"]
 
 
 # Stopping it

@@ -44,6 +44,19 @@ def write_results(
         "posterior.npz": lambda path: write_arrays(path, posterior_arrays(posterior)),
         "subgoals.png": lambda path: draw_summary(summary, grid_map, path),
     }
+    return write_whole(folder, writers)
+
+
+def write_whole(folder: Path, writers: Mapping[str, Callable[[Path], object]]) -> list[Path]:
+    """Write files into a folder, each whole or not at all; returns their paths.
+
+    Args:
+        folder: made where it is not there.
+        writers: by name of the file, what writes it to a path.
+
+    Raises:
+        InputError: the folder cannot be written to.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, write in writers.items():

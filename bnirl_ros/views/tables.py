@@ -27,7 +27,7 @@ def report(summary: Summary) -> str:
 def subgoal_table(subgoals: Sequence[Subgoal], visit_sequence: Sequence[int]) -> str:
     """The columns of the subgoals side by side, a line for each; no newline at the end."""
     columns = subgoal_columns(subgoals, visit_sequence).items()
-    return _aligned(list(zip(*([heading, *texts] for heading, texts in columns), strict=True)))
+    return aligned(list(zip(*([heading, *texts] for heading, texts in columns), strict=True)))
 
 
 def subgoal_columns(
@@ -73,10 +73,10 @@ def parameter_table(parameters: Sequence[Parameter]) -> str:
         )
         for parameter in parameters
     ]
-    return _aligned([("parameter", "median", "90 % interval"), *rows])
+    return aligned([("parameter", "median", "90 % interval"), *rows])
 
 
-def _aligned(table: Sequence[Sequence[str]]) -> str:
+def aligned(table: Sequence[Sequence[str]]) -> str:
     """The rows as lines, each column flush right and as wide as it has to be."""
     widths = [max(len(text) for text in column) for column in zip(*table, strict=True)]
     return "\n".join(
