@@ -18,6 +18,7 @@ import numba
 import numpy as np
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.inference.posterior import infer
+from bnirl_ros.inference.prediction import predict
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.maps.grid_map import GridMap
 from bnirl_ros.mdp.finite_mdp import FiniteMDP
@@ -65,6 +66,9 @@ for seed in range(60):
     assert np.isfinite(posterior.draws.log_joint).all()
     assert np.isfinite(posterior.mode.log_joint)
     assert posterior.pursuit_counts().sum(axis=1).max() <= count
+    if seed < 10:
+        probability = predict(posterior, demonstration, GridMap(free)).probability
+        np.testing.assert_allclose(probability.sum(axis=1), 1.0)
     if seed < 5:
         goals = world.states_of(np.column_stack([x, y]))
         mdp = FiniteMDP.from_transitions(world.transitions(), 0.9)

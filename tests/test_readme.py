@@ -21,9 +21,11 @@ from bnirl_ros.demonstrations.messages import TOPIC_TYPES
 from bnirl_ros.demonstrations.placement import place
 from bnirl_ros.experiments.scenarios import PAPER_LOOP
 from bnirl_ros.inference.posterior import infer
+from bnirl_ros.inference.prediction import by_outcome, predict_at
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.inference.summary import summarise
 from bnirl_ros.maps import GridMap
+from bnirl_ros.mdp.actions import ACTION_NAMES
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -80,7 +82,7 @@ def test_python_example_runs_and_finds_the_true_subgoals() -> None:
 @pytest.mark.parametrize("arguments", arguments_of("bnirl"), ids=shlex.join)
 def test_commands_parse(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     # A command's bare name, in prose, gets something to work on, and all of them show their help.
-    if arguments == ["infer"]:
+    if arguments in (["infer"], ["predict"]):
         arguments = [*arguments, "bags/paper_loop"]
     if arguments == ["replay"]:  # its options are replay_node's: see below
         return
@@ -260,3 +262,22 @@ def test_table_of_the_demo(kitchen: tuple[Demonstration, GridMap]) -> None:
     for subgoal in found[6:]:
         assert subgoal.pursuits == pytest.approx(rest.get(subgoal.cell, 0.0), abs=3.0)
         assert (subgoal.pursuits or 0.0) < (found[5].pursuits or 0.0) / 8
+
+
+def test_table_of_what_is_foreseen(kitchen: tuple[Demonstration, GridMap]) -> None:
+    """With fewer sweeps than the default, which tell the same but for a few hundredths."""
+    demonstration, grid_map = kitchen
+    settings = Settings(moves=4, sweeps=300, burn_in=100, chains=2)
+    pattern = r"^ +\((\d+), (\d+)\)  ((?:\w+ [\d.]+,? )+) +\((\d+), (\d+)\) +([\d.]+)$"
+    told = re.findall(pattern, README, re.MULTILINE)
+    (arguments,) = (each for each in arguments_of("bnirl", "predict") if "--cell" in each)
+    cells = [[int(x), int(y)] for x, y, *_ in told]
+    assert [f"{x},{y}" for x, y in cells] == arguments[arguments.index("--cell") + 1 :: 2]
+    foreseen = predict_at(infer(demonstration, grid_map, settings), cells, grid_map)
+    outcomes = by_outcome(foreseen.probability, foreseen.same)
+    for row, (_, _, actions, _, _, share) in enumerate(told):
+        for words in actions.split(","):
+            name, probability = words.split()
+            column = foreseen.actions.tolist().index(ACTION_NAMES.index(name))
+            assert outcomes[row, column] == pytest.approx(float(probability), abs=0.04)
+        assert foreseen.subgoal_probability[row] == pytest.approx(float(share), abs=0.04)
