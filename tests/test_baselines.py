@@ -433,6 +433,20 @@ def test_subgradient_method_comes_to_the_minimum(seed: int) -> None:
     assert objectives[0] > least + 0.02
 
 
+def test_the_reward_is_that_of_the_weighted_mean_of_the_points() -> None:
+    mdp, observed, features = planning_case(3)
+    planning = MaximumMarginPlanning(mdp, observed, features, regularisation=0.3)
+    points = [np.zeros(2)]
+    for count in range(1, 8):
+        reward = planning.iterate().reward
+        objective, subgradient = planning.objective_at(points[-1])
+        assert planning.objective == pytest.approx(objective)
+        points.append(points[-1] - subgradient / (0.3 * count))
+        expected = np.average(points[1:], axis=0, weights=np.arange(1, count + 1))
+        np.testing.assert_allclose(planning.weights, expected, atol=1e-9)
+        np.testing.assert_allclose(reward, features @ expected, atol=1e-9)
+
+
 def test_plans_of_one_step_gain_where_they_start() -> None:
     mdp, observed, features = planning_case(0)
     linear = LinearRewards.of(mdp, observed, features)
@@ -528,6 +542,16 @@ def test_walks_end_as_the_enumerated_posterior_says() -> None:
     limit = np.quantile(((simulated - expected) ** 2 / expected).sum(axis=1), 0.999)
     assert ((counts - expected) ** 2 / expected).sum() < limit
     assert ((walks / side**2 - expected) ** 2 / expected).sum() > 1.5 * limit
+
+
+def test_walks_begin_anywhere_on_the_grid() -> None:
+    case = planning_case(0)
+    starts = {
+        tuple(PolicyWalk(*case, np.random.default_rng(seed), steps_to_one=1).weights)
+        for seed in range(250)
+    }
+    # One of the nine is missing, by chance, for 9 (8 / 9)^250 = 1.5e-12 of the choices of seeds.
+    assert starts == {(x, y) for x, y in weight_grid(1)}
 
 
 class ResolvingWalk(PolicyWalk):
