@@ -279,7 +279,7 @@ def test_after_a_replay_human_play_gives_the_posterior_of_the_command(
     whole = place(recorded.recording, recorded.grid_map).demonstration
     bag = tmp_path / "human"
     write_demonstration(bag, first_episodes(whole, 2), recorded.grid_map, step=0.15)
-    replay_and_compare(bag, {"sweeps": 2000, "burn_in": 500}, tmp_path, start, subgoals)
+    replay_and_compare(bag, {"sweeps": 1000, "burn_in": 400}, tmp_path, start, subgoals)
 
 
 def test_feature_subgoals_live_are_those_of_the_command_and_show_all_their_cells(
@@ -554,7 +554,7 @@ def test_callbacks_are_served_while_inference_runs(
     subgoals: Callable[..., Subgoals], peer: Peer, tmp_path: Path
 ) -> None:
     # Two inferences of a second or more, asked for at once.
-    node = subgoals(sweeps=8_000, burn_in=0, thin=100, result_folder=tmp_path)
+    node = subgoals(sweeps=800, burn_in=0, thin=10, result_folder=tmp_path)
     assert node.call("pause", services.SetBool.Request(data=True)).success
     node.send([map_of_grid()], walk(rounds=20))
     node.until_health("all", queue=str(20 * (2 * OBSERVATIONS_OF_WALK + 1)))
