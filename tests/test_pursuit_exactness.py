@@ -24,7 +24,7 @@ from bnirl_ros.inference.draws import Draws
 from bnirl_ros.inference.runs import run_counts, runs
 from bnirl_ros.mdp.grid_world import GridWorld
 from bnirl_ros.model.mixture import SubgoalMixture, subgoal_mixture
-from bnirl_ros.model.pursuits import PRIORS, PursuitModel, pursuit_model
+from bnirl_ros.model.pursuits import ALPHA, PRIORS, PursuitModel, pursuit_model
 from pursuit_reference import (
     PursuitEnumeration,
     Story,
@@ -173,7 +173,7 @@ def test_blocks_that_end_within_an_episode_agree_with_every_history(name: str) -
     generator = np.random.default_rng(3)
     state = pursuit_gibbs.initial_state(model, generator)
     kernel = pursuit_gibbs.kernel_model(model)
-    chosen = pursuit_gibbs.softmax_table(kernel, state.parameters[pursuit_gibbs.ALPHA])
+    chosen = pursuit_gibbs.softmax_table(kernel, state.parameters[ALPHA])
     subgoal_of = np.empty((100_000, len(model.state_of)), dtype=np.int32)
     switched = np.empty(subgoal_of.shape, dtype=np.bool_)
     forward = np.empty((2, len(model.prior)))

@@ -17,9 +17,8 @@ from bnirl_ros.inference.posterior import Posterior, grid_world, pursuit_model_o
 from bnirl_ros.inference.pursuit_gibbs import forward_pass, kernel_model, softmax_table
 from bnirl_ros.inference.runs import run_counts
 from bnirl_ros.maps.grid_map import GridMap
-from bnirl_ros.model.pursuits import PRIORS, PursuitModel
+from bnirl_ros.model.pursuits import ALPHA, ETA, PRIORS, PursuitModel
 
-_ETA = list(PRIORS).index("eta")
 _DRAWS = 64  # of the posterior, over which a prediction is averaged
 
 
@@ -39,7 +38,7 @@ def filtered(
         parameters: in the order of `PRIORS`.
     """
     kernel = kernel_model(model)
-    chosen = softmax_table(kernel, parameters[0])
+    chosen = softmax_table(kernel, parameters[ALPHA])
     belief = np.empty((len(model.state_of), len(weights)))
     evidence = np.empty(len(belief))
     bounds = [*np.flatnonzero(model.starts), len(belief)]
@@ -102,11 +101,11 @@ def weights_of_draws(
         rho = model.switch_probability(subgoal_of, values)[1:][same]
         counts = runs[index].astype(np.float64)
         for _ in range(5):  # a fixed point, soon near enough
-            weights = _urn_weights(model, values[_ETA], counts)
+            weights = _urn_weights(model, values[ETA], counts)
             again = rho * weights[kept]
             expected = again / (1.0 - rho + again)
             counts = runs[index] + np.bincount(kept, weights=expected, minlength=len(weights))
-        result[index] = _urn_weights(model, values[_ETA], counts)
+        result[index] = _urn_weights(model, values[ETA], counts)
     return result
 
 
@@ -180,7 +179,7 @@ class SubgoalFilter:
         )
         self._model = pursuit_model_of(every, self.candidates, grid_map, posterior.settings)
         self._kernel = kernel_model(self._model)
-        self._chosen = softmax_table(self._kernel, self._parameters[0])
+        self._chosen = softmax_table(self._kernel, self._parameters[ALPHA])
         # By cell: the number of a state tells nothing of a cell beyond the map's edge.
         self._row_of_cell = {
             (int(x), int(y)): row for row, (x, y) in enumerate(self._world.cells_of(states))

@@ -27,7 +27,16 @@ from numba import njit
 
 from bnirl_ros.inference.draws import Draws
 from bnirl_ros.inference.kernels import categorical, count_draws, number_in_order
-from bnirl_ros.model.pursuits import PRIORS, PursuitModel
+from bnirl_ros.model.pursuits import (
+    ALPHA,
+    AT_SUBGOAL,
+    ELSEWHERE,
+    ETA,
+    ON_ARRIVAL,
+    PRIORS,
+    SLIP,
+    PursuitModel,
+)
 
 _SHORTEST_BLOCK, _LONGEST_BLOCK = 8, 1024  # observations; their logarithm is uniform
 _BLOCK_ENTRIES = 4_000_000  # of the forward messages: shorter blocks where candidates are many
@@ -41,9 +50,6 @@ _RAREST = 1e-12  # probabilities stay off 0 and 1, which would rule out what is 
 
 LEAST_PROBABILITY = 1e-200
 """Of an action that cannot be: it is only very improbable, so that a filter has something left."""
-
-# Columns of the parameters, in the order of `PRIORS`.
-ALPHA, ETA, SLIP, ON_ARRIVAL, AT_SUBGOAL, ELSEWHERE = range(len(PRIORS))
 
 
 class PursuitState(NamedTuple):

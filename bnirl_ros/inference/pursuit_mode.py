@@ -19,10 +19,6 @@ from bnirl_ros.inference.draws import Draws
 from bnirl_ros.inference.kernels import count_draws
 from bnirl_ros.inference.mode import Mode
 from bnirl_ros.inference.pursuit_gibbs import (
-    ALPHA,
-    ELSEWHERE,
-    ETA,
-    SLIP,
     filled_forward,
     group_scores,
     kernel_model,
@@ -35,7 +31,7 @@ from bnirl_ros.inference.pursuit_gibbs import (
     urn_ratio,
     urn_weights,
 )
-from bnirl_ros.model.pursuits import PRIORS, PursuitModel
+from bnirl_ros.model.pursuits import ALPHA, ELSEWHERE, ETA, PRIORS, SLIP, PursuitModel
 
 _GAIN = 1e-9  # nats; a smaller gain is rounding
 _BLOCKS = (np.int64(1024), np.int64(32))  # observations that the Viterbi algorithm takes at once

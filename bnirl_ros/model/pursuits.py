@@ -70,6 +70,9 @@ switch_at_subgoal: the same in every further state there; it has stayed.
 switch_elsewhere: the same everywhere else; it changed its mind.
 """
 
+# Columns of arrays of the parameters, which are in the order of `PRIORS`.
+ALPHA, ETA, SLIP, ON_ARRIVAL, AT_SUBGOAL, ELSEWHERE = range(len(PRIORS))
+
 VALUE_ALPHA = Prior("log-normal", 50.0, 1.5)
 """The prior of alpha where the cost of an action is what it loses of Q*, as in (7)."""
 
@@ -121,7 +124,7 @@ class PursuitModel:
 
     def action_likelihood(self, parameters: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """(U, A, G) P(a | s, g), slips included, with parameters in the order of `PRIORS`."""
-        alpha, slip = parameters[0], parameters[2]
+        alpha, slip = parameters[ALPHA], parameters[SLIP]
         weights = np.exp(-alpha * self.cost)
         chosen = weights / weights.sum(axis=1, keepdims=True)
         uniform = np.isfinite(self.cost) * self.uniform[:, None, None]
@@ -164,7 +167,7 @@ class PursuitModel:
         likelihood = self.action_likelihood(parameters)
         probability = likelihood[self.state_of, self.action_of, subgoals]
         rho = self.switch_probability(subgoals, parameters)
-        eta = parameters[1]
+        eta = parameters[ETA]
         counts = np.bincount(subgoals[switched], minlength=len(self.prior))
         with np.errstate(divide="ignore"):
             total = np.log(probability).sum() + np.log(np.where(switched, rho, 1.0 - rho)).sum()
@@ -180,7 +183,7 @@ def _rho(
     parameters: npt.NDArray[np.float64],
 ) -> npt.NDArray[np.float64]:
     """Probability of a switch, by whether the demonstrator is at its subgoal, and already was."""
-    on_arrival, at_subgoal, elsewhere = parameters[3:]
+    on_arrival, at_subgoal, elsewhere = parameters[[ON_ARRIVAL, AT_SUBGOAL, ELSEWHERE]]
     return np.where(here, np.where(there_already, at_subgoal, on_arrival), elsewhere)
 
 
