@@ -305,9 +305,14 @@ def softmax_table(model, alpha):  # type: ignore[no-untyped-def]
 @njit(nogil=True, cache=True)
 def likelihood(model, parameters, chosen, t, candidate):  # type: ignore[no-untyped-def]
     """P(a_t | s_t, g), slips included."""
-    slip = parameters[SLIP]
-    uniform = model.uniform[model.state_of[t]]
-    return (1.0 - slip) * chosen[model.pair_of[t], candidate] + slip * uniform
+    explained = (1.0 - parameters[SLIP]) * chosen[model.pair_of[t], candidate]
+    return explained + unexplained(model, parameters, t)
+
+
+@njit(nogil=True, cache=True)
+def unexplained(model, parameters, t):  # type: ignore[no-untyped-def]
+    """The part of a slip in P(a_t | s_t, g)."""
+    return parameters[SLIP] * model.uniform[model.state_of[t]]
 
 
 @njit(nogil=True, cache=True)
@@ -661,7 +666,7 @@ def _restricted(model, candidates):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True)
 def _draw_groups(model, state, chosen, generator):  # type: ignore[no-untyped-def]
-    """Step 2: partitions of the draws given their subgoals, then each partition's subgoal.
+    """Step 4: partitions of the draws given their subgoals, then each partition's subgoal.
 
     P(partitions | subgoals): among the draws of g, a Chinese restaurant process with concentration
     eta P(g). P(subgoal | partition): P(g) times the product of all that its observations say.
@@ -763,11 +768,9 @@ def _log(probability):  # type: ignore[no-untyped-def]
 @njit(nogil=True, cache=True)
 def _draw_slips(model, state, chosen, generator):  # type: ignore[no-untyped-def]
     """Which actions are slips."""
-    slip = state.parameters[SLIP]
     for t in range(state.subgoal_of.shape[0]):
-        unexplained = slip * model.uniform[model.state_of[t]]
-        explained = (1.0 - slip) * chosen[model.pair_of[t], state.subgoal_of[t]]
-        state.slipped[t] = generator.random() * (explained + unexplained) < unexplained
+        total = likelihood(model, state.parameters, chosen, t, state.subgoal_of[t])
+        state.slipped[t] = generator.random() * total < unexplained(model, state.parameters, t)
 
 
 @njit(nogil=True, cache=True)
@@ -810,7 +813,7 @@ def _draw_switches(model, state, generator):  # type: ignore[no-untyped-def]
         if model.starts[t] or candidate != state.subgoal_of[t - 1]:
             state.switched[t] = True
         else:
-            rho = state.parameters[ON_ARRIVAL + _place(model, t, candidate)]
+            rho = switch_probability(model, state.parameters, t, candidate)
             again = rho * weights[candidate]
             state.switched[t] = generator.random() * (1.0 - rho + again) < again
         state.counts[candidate] += state.switched[t]

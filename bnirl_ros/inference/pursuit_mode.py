@@ -28,6 +28,7 @@ from bnirl_ros.inference.pursuit_gibbs import (
     softmax_table,
     state_of,
     switch_probability,
+    unexplained,
     urn_ratio,
     urn_weights,
 )
@@ -130,9 +131,8 @@ def _ascend(model, state):  # type: ignore[no-untyped-def]
     count = state.subgoal_of.shape[0]
     slipped = np.empty(count, dtype=np.bool_)
     for t in range(count):
-        unexplained = state.parameters[SLIP] * model.uniform[model.state_of[t]]
         total = likelihood(model, state.parameters, chosen, t, state.subgoal_of[t])
-        slipped[t] = unexplained > 0.5 * total
+        slipped[t] = unexplained(model, state.parameters, t) > 0.5 * total
     return value, slipped
 
 
