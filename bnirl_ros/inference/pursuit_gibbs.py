@@ -735,9 +735,9 @@ def group_scores(model, state, chosen, groups):  # type: ignore[no-untyped-def]
         for candidate in near(model, t):
             rho = switch_probability(model, parameters, t, candidate)
             if state.switched[t]:
-                scores[group, candidate] += _log(rho) - _log(usual)
+                scores[group, candidate] += floored_log(rho) - floored_log(usual)
             else:
-                scores[group, candidate] += _log(1.0 - rho) - _log(1.0 - usual)
+                scores[group, candidate] += floored_log(1.0 - rho) - floored_log(1.0 - usual)
     slip = parameters[SLIP]
     row = np.empty(candidates)
     for pair in range(pairs):
@@ -747,7 +747,9 @@ def group_scores(model, state, chosen, groups):  # type: ignore[no-untyped-def]
                 if not known:
                     uniform = slip * model.uniform[model.pair_state[pair]]
                     for candidate in range(candidates):
-                        row[candidate] = _log((1.0 - slip) * chosen[pair, candidate] + uniform)
+                        row[candidate] = floored_log(
+                            (1.0 - slip) * chosen[pair, candidate] + uniform
+                        )
                     known = True
                 scores[group] += tally[group, pair] * row
     for group in range(groups):
@@ -760,7 +762,7 @@ def group_scores(model, state, chosen, groups):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _log(probability):  # type: ignore[no-untyped-def]
+def floored_log(probability):  # type: ignore[no-untyped-def]
     """A logarithm of which differences can be taken: impossible is e^-690."""
     return math.log(max(probability, 1e-300))
 
@@ -975,7 +977,7 @@ def _log_density(model, parameters, parameter, evidence, scaled):  # type: ignor
         for action in range(1, costs.shape[1]):
             total += math.exp(-alpha * costs[row, action])
         explained = (1.0 - slip) * math.exp(-alpha * costs[row, 0]) / total
-        density += times[row] * _log(explained + slip * uniform[row])
+        density += times[row] * floored_log(explained + slip * uniform[row])
     return density
 
 
@@ -984,10 +986,10 @@ def log_joint_of(model, state, chosen):  # type: ignore[no-untyped-def]
     """As `PursuitModel.log_joint`."""
     parameters, total = state.parameters, 0.0
     for t in range(state.subgoal_of.shape[0]):
-        total += _log(likelihood(model, parameters, chosen, t, state.subgoal_of[t]))
+        total += floored_log(likelihood(model, parameters, chosen, t, state.subgoal_of[t]))
         if not model.starts[t]:
             rho = switch_probability(model, parameters, t, state.subgoal_of[t - 1])
-            total += _log(rho if state.switched[t] else 1.0 - rho)
+            total += floored_log(rho if state.switched[t] else 1.0 - rho)
     eta = parameters[ETA]
     drawn = np.zeros(model.parts, dtype=np.int64)
     for candidate in range(state.counts.shape[0]):

@@ -20,6 +20,7 @@ from bnirl_ros.inference.kernels import count_draws
 from bnirl_ros.inference.mode import Mode
 from bnirl_ros.inference.pursuit_gibbs import (
     filled_forward,
+    floored_log,
     group_scores,
     kernel_model,
     likelihood,
@@ -245,7 +246,8 @@ def _best_block(model, state, likely, first, end, forbidden):  # type: ignore[no
 
 
 @njit(nogil=True, cache=True)
-def _log(probability):  # type: ignore[no-untyped-def]
+def _infinite_log(probability):  # type: ignore[no-untyped-def]
+    """A logarithm that rules out what is impossible."""
     return math.log(probability) if probability > 0.0 else -np.inf
 
 
@@ -258,7 +260,7 @@ def _viterbi(model, parameters, likely, weights, theta, first, end, last):  # ty
     candidates = weights.shape[0]
     log_weights = np.empty(candidates)
     for candidate in range(candidates):
-        log_weights[candidate] = _log(weights[candidate])
+        log_weights[candidate] = _infinite_log(weights[candidate])
     best = np.full(candidates, -np.inf)
     if not model.starts[first]:
         best[theta[first - 1]] = 0.0
@@ -272,12 +274,12 @@ def _viterbi(model, parameters, likely, weights, theta, first, end, last):  # ty
             best[:] = log_weights
             came_by_switch[i] = True
         else:
-            leaving[:] = best + _log(elsewhere)
-            keeping = best + _log(1.0 - elsewhere)
+            leaving[:] = best + _infinite_log(elsewhere)
+            keeping = best + _infinite_log(1.0 - elsewhere)
             for candidate in near(model, t):
                 rho = switch_probability(model, parameters, t, candidate)
-                leaving[candidate] = best[candidate] + _log(rho)
-                keeping[candidate] = best[candidate] + _log(1.0 - rho)
+                leaving[candidate] = best[candidate] + _infinite_log(rho)
+                keeping[candidate] = best[candidate] + _infinite_log(1.0 - rho)
             came_from[i] = leaving.argmax()
             leave = leaving[came_from[i]]
             for candidate in range(candidates):
@@ -306,7 +308,7 @@ def _path_score(model, parameters, likely, weights, path, switched, theta, first
         if not model.starts[t]:
             before = path[i - 1] if i > 0 else theta[first - 1]
             rho = switch_probability(model, parameters, t, before)
-            score += math.log(max(rho if switched[i] else 1.0 - rho, 1e-300))
+            score += floored_log(rho if switched[i] else 1.0 - rho)
         if switched[i]:
             score += math.log(weights[path[i]])
         score += likely[model.pair_of[t], path[i]]
