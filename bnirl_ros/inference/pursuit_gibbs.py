@@ -672,7 +672,8 @@ def _draw_groups(model, state, chosen, generator):  # type: ignore[no-untyped-de
     eta P(g). P(subgoal | partition): P(g) times the product of all that its observations say.
     """
     groups = _draw_partitions(model, state, generator)
-    scores = group_scores(model, state, chosen, groups)
+    likely = log_likelihood_table(model, state.parameters, chosen)
+    scores = group_scores(model, state, likely, groups)
     subgoal = np.empty(groups, dtype=np.int32)
     for group in range(groups):
         weights = np.exp(scores[group] - scores[group].max())
@@ -716,8 +717,21 @@ def _draw_partitions(model, state, generator):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def group_scores(model, state, chosen, groups):  # type: ignore[no-untyped-def]
-    """(J, G) log of P(g) times all probabilities in which a partition's subgoal occurs."""
+def log_likelihood_table(model, parameters, chosen):  # type: ignore[no-untyped-def]
+    """(K, G) log P(a | s, g) of each distinct pair, slips included."""
+    table = np.empty_like(chosen)
+    for pair in range(chosen.shape[0]):
+        by_slip = parameters[SLIP] * model.uniform[model.pair_state[pair]]
+        table[pair] = np.log((1.0 - parameters[SLIP]) * chosen[pair] + by_slip)
+    return table
+
+
+@njit(nogil=True, cache=True)
+def group_scores(model, state, likely, groups):  # type: ignore[no-untyped-def]
+    """(J, G) log of P(g) times all probabilities in which a partition's subgoal occurs.
+
+    `likely` (K, G) is the `log_likelihood_table`.
+    """
     parameters, candidates = state.parameters, model.prior.shape[0]
     pairs = model.pair_state.shape[0]
     tally = np.zeros((groups, pairs), dtype=np.int32)
@@ -738,20 +752,10 @@ def group_scores(model, state, chosen, groups):  # type: ignore[no-untyped-def]
                 scores[group, candidate] += floored_log(rho) - floored_log(usual)
             else:
                 scores[group, candidate] += floored_log(1.0 - rho) - floored_log(1.0 - usual)
-    slip = parameters[SLIP]
-    row = np.empty(candidates)
     for pair in range(pairs):
-        known = False
         for group in range(groups):
             if tally[group, pair] > 0:
-                if not known:
-                    uniform = slip * model.uniform[model.pair_state[pair]]
-                    for candidate in range(candidates):
-                        row[candidate] = floored_log(
-                            (1.0 - slip) * chosen[pair, candidate] + uniform
-                        )
-                    known = True
-                scores[group] += tally[group, pair] * row
+                scores[group] += tally[group, pair] * likely[pair]
     for group in range(groups):
         for candidate in range(candidates):
             if model.candidate_part[candidate] == part[group]:

@@ -25,6 +25,7 @@ from bnirl_ros.inference.pursuit_gibbs import (
     kernel_model,
     likelihood,
     log_joint_of,
+    log_likelihood_table,
     near,
     softmax_table,
     state_of,
@@ -33,7 +34,7 @@ from bnirl_ros.inference.pursuit_gibbs import (
     urn_ratio,
     urn_weights,
 )
-from bnirl_ros.model.pursuits import ALPHA, ELSEWHERE, ETA, PRIORS, SLIP, PursuitModel
+from bnirl_ros.model.pursuits import ALPHA, ELSEWHERE, ETA, PRIORS, PursuitModel
 
 _GAIN = 1e-9  # nats; a smaller gain is rounding
 _BLOCKS = (np.int64(1024), np.int64(32))  # observations that the Viterbi algorithm takes at once
@@ -104,7 +105,7 @@ def _next_known(subgoal_of: npt.NDArray[np.int32], model: PursuitModel) -> npt.N
 def _ascend(model, state):  # type: ignore[no-untyped-def]
     """Ascent that changes `state`; returns the log joint and (N,) which actions are slips."""
     chosen = softmax_table(model, state.parameters[ALPHA])
-    likely = _log_likelihood(model, state.parameters, chosen)
+    likely = log_likelihood_table(model, state.parameters, chosen)
     value = _climb(model, state, chosen, likely)
     gained = True
     while gained:
@@ -113,7 +114,7 @@ def _ascend(model, state):  # type: ignore[no-untyped-def]
             if not 0 < state.counts[candidate] <= _FEW:
                 continue
             # Given up (-1), or one of the most likely candidates in its place.
-            for replacement in _replacements(model, state, chosen, candidate):
+            for replacement in _replacements(model, state, likely, candidate):
                 subgoal_of, switched = state.subgoal_of.copy(), state.switched.copy()
                 if replacement < 0:
                     _improve_blocks(model, state, likely, _BLOCKS[0], candidate, candidate)
@@ -138,29 +139,19 @@ def _ascend(model, state):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _log_likelihood(model, parameters, chosen):  # type: ignore[no-untyped-def]
-    """(K, G) log P(a | s, g) of each distinct pair, slips included."""
-    table = np.empty_like(chosen)
-    for pair in range(chosen.shape[0]):
-        unexplained = parameters[SLIP] * model.uniform[model.pair_state[pair]]
-        table[pair] = np.log((1.0 - parameters[SLIP]) * chosen[pair] + unexplained)
-    return table
-
-
-@njit(nogil=True, cache=True)
-def _replacements(model, state, chosen, candidate):  # type: ignore[no-untyped-def]
+def _replacements(model, state, likely, candidate):  # type: ignore[no-untyped-def]
     """-1, and the candidates that suit the pursuits of one best; none for the only one there."""
     state.partition_of[:] = 1
     for t in range(state.subgoal_of.shape[0]):
         if state.subgoal_of[t] == candidate:
             state.partition_of[t] = 0
-    scores = group_scores(model, state, chosen, np.int64(2))[0]
-    likely = scores.argsort()[::-1][:_REPLACEMENTS]
+    scores = group_scores(model, state, likely, np.int64(2))[0]
+    best = scores.argsort()[::-1][:_REPLACEMENTS]
     # Those of another part of the map, at -inf, are none.
-    likely = likely[(scores[likely] > -np.inf) & (likely != candidate)]
-    replacements = np.full(likely.shape[0] + 1, -1, dtype=np.int64)
-    replacements[1:] = likely
-    return replacements if likely.shape[0] > 0 else likely
+    best = best[(scores[best] > -np.inf) & (best != candidate)]
+    replacements = np.full(best.shape[0] + 1, -1, dtype=np.int64)
+    replacements[1:] = best
+    return replacements if best.shape[0] > 0 else best
 
 
 @njit(nogil=True, cache=True)
@@ -188,7 +179,7 @@ def _climb(model, state, chosen, likely):  # type: ignore[no-untyped-def]
     while True:
         for length in _BLOCKS:
             _improve_blocks(model, state, likely, length, _NONE, _NONE)
-        _move_subgoals(model, state, chosen)
+        _move_subgoals(model, state, chosen, likely)
         now = log_joint_of(model, state, chosen)
         if now <= value + _GAIN:
             return now
@@ -316,7 +307,7 @@ def _path_score(model, parameters, likely, weights, path, switched, theta, first
 
 
 @njit(nogil=True, cache=True)
-def _move_subgoals(model, state, chosen):  # type: ignore[no-untyped-def]
+def _move_subgoals(model, state, chosen, likely):  # type: ignore[no-untyped-def]
     """All pursuits of a subgoal to the candidate that suits them best, if the joint gains."""
     candidates = state.counts.shape[0]
     group_of = np.full(candidates, -1, dtype=np.int32)
@@ -326,7 +317,7 @@ def _move_subgoals(model, state, chosen):  # type: ignore[no-untyped-def]
             group_of[state.subgoal_of[t]] = groups
             groups += 1
         state.partition_of[t] = group_of[state.subgoal_of[t]]
-    scores = group_scores(model, state, chosen, groups)
+    scores = group_scores(model, state, likely, groups)
     value = log_joint_of(model, state, chosen)
     for old in range(candidates):
         if group_of[old] < 0:
