@@ -804,7 +804,6 @@ def _draw_switches(model, state, generator):  # type: ignore[no-untyped-def]
         if not model.is_fixed[parameter]:
             evidence = Evidence(
                 no_counts,
-                no_counts,
                 no_costs,
                 nothing,
                 nothing,
@@ -844,7 +843,6 @@ class Evidence(NamedTuple):
 
     Attributes:
         counts: (G,) on eta: draws of each candidate.
-        drawn: (P,) their number in each part.
         costs: (M, A + 1) on alpha and slip: costs of an action taken, and of all actions.
         times: (M,) how often.
         uniform: (M,) its probability if it is a slip.
@@ -854,7 +852,6 @@ class Evidence(NamedTuple):
     """
 
     counts: npt.NDArray[np.int64]
-    drawn: npt.NDArray[np.int64]
     costs: npt.NDArray[np.float64]
     times: npt.NDArray[np.float64]
     uniform: npt.NDArray[np.float64]
@@ -867,17 +864,13 @@ class Evidence(NamedTuple):
 def _draw_concentration(model, state, generator):  # type: ignore[no-untyped-def]
     """Eta, given the draws from the urns."""
     if not model.is_fixed[ETA]:
-        drawn = np.zeros(model.parts, dtype=np.int64)
-        for candidate in range(state.counts.shape[0]):
-            drawn[model.candidate_part[candidate]] += state.counts[candidate]
         nothing = np.empty(0)
         evidence = Evidence(
             state.counts,
-            drawn,
             np.empty((0, 1)),
             nothing,
             nothing,
-            drawn[:0],
+            state.counts[:0],
             nothing,
             nothing,
         )
@@ -909,7 +902,7 @@ def _draw_action_parameters(model, state, chosen, confidence_too, generator):  #
         rows += 1
     none = state.counts[:0]
     evidence = Evidence(
-        none, none, costs[:rows], times[:rows], uniform[:rows], none, times[:0], times[:0]
+        none, costs[:rows], times[:rows], uniform[:rows], none, times[:0], times[:0]
     )
     if not model.is_fixed[SLIP]:
         _draw_by_slice(model, state.parameters, np.int64(SLIP), evidence, generator)
@@ -962,13 +955,9 @@ def _log_density(model, parameters, parameter, evidence, scaled):  # type: ignor
         density = -0.5 * ((scaled - math.log(first)) / second) ** 2
     else:
         density = first * math.log(value) + second * math.log1p(-value)
-    counts, drawn, costs, times, uniform, changes, same, weights = evidence
-    for part in range(drawn.shape[0]):
-        density += math.lgamma(value) - math.lgamma(value + drawn[part])
-    for candidate in range(counts.shape[0]):
-        if counts[candidate] > 0:
-            weight = value * model.prior[candidate]
-            density += math.lgamma(weight + counts[candidate]) - math.lgamma(weight)
+    counts, costs, times, uniform, changes, same, weights = evidence
+    if parameter == ETA:
+        density += log_urns(model, value, counts)
     for number in changes:
         density += number * math.log(value)
     for candidate in range(same.shape[0]):
@@ -994,10 +983,16 @@ def log_joint_of(model, state, chosen):  # type: ignore[no-untyped-def]
         if not model.starts[t]:
             rho = switch_probability(model, parameters, t, state.subgoal_of[t - 1])
             total += floored_log(rho if state.switched[t] else 1.0 - rho)
-    eta = parameters[ETA]
+    return total + log_urns(model, parameters[ETA], state.counts)
+
+
+@njit(nogil=True, cache=True)
+def log_urns(model, eta, counts):  # type: ignore[no-untyped-def]
+    """Log probability of the draws (G,) from the urns of all parts, whatever their order."""
+    total = 0.0
     drawn = np.zeros(model.parts, dtype=np.int64)
-    for candidate in range(state.counts.shape[0]):
-        count = state.counts[candidate]
+    for candidate in range(counts.shape[0]):
+        count = counts[candidate]
         if count > 0:
             weight = eta * model.prior[candidate]
             total += math.lgamma(weight + count) - math.lgamma(weight)
