@@ -154,8 +154,9 @@ def middle_of_draws(
 class SubgoalFilter:
     """Watches a demonstrator and tells, action by action, what it is going for now.
 
-    With the posterior medians of parameters and weights. Holds the action likelihoods of all free
-    cells: their number times that of actions times that of candidates.
+    With the posterior medians of the parameters, and the mean of the weights over some draws.
+    Holds the action likelihoods of all free cells: their number times that of actions times that
+    of candidates.
     """
 
     def __init__(self, posterior: Posterior, grid_map: GridMap) -> None:

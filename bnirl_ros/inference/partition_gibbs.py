@@ -109,17 +109,10 @@ def going_on(
     candidate_now: npt.NDArray[np.int64],
     generator: np.random.Generator,
 ) -> PartitionState:
-    """A state of a changed demonstration that goes on from an older one.
+    """A state that goes on from an older one, see `Sampler.going_on`.
 
     What was observed then keeps its partition and subgoal, as far as the subgoal is still a
     candidate; other observations are seated one by one by (14) given those before.
-
-    Args:
-        mixture: the model of the observations now.
-        state: of the observations before.
-        row_before: (N,) row of each observation before; -1 for a new one.
-        candidate_now: (G before,) index of each candidate now; -1 for none.
-        generator: source of randomness.
     """
     partitions = np.full(len(row_before), -1, dtype=np.int64)
     known = np.flatnonzero(row_before >= 0)

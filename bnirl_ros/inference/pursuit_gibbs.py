@@ -163,16 +163,9 @@ def going_on(
     candidate_now: npt.NDArray[np.int64],
     generator: np.random.Generator,
 ) -> PursuitState:
-    """A state of a changed demonstration that goes on from an older one.
+    """A state that goes on from an older one, see `Sampler.going_on`.
 
     What was observed then keeps its subgoal; a new observation keeps that of the one before it.
-
-    Args:
-        model: of the observations now.
-        state: of the observations before.
-        row_before: (N,) row of each observation before; -1 for a new one.
-        candidate_now: (G before,) index of each candidate now; -1 for none.
-        generator: source of randomness.
     """
     known = row_before >= 0
     subgoal_of = np.full(len(row_before), -1, dtype=np.int32)

@@ -97,9 +97,9 @@ class Summary:
         rank_of: (N,) int64: rank of the subgoal to which the mode assigns each observation; 0 for
             an unexplained one.
         cell_probability: (height, width) float64: posterior probability that a cell is a subgoal.
-        rhat: split R-hat, the larger one of log joint and number of partitions; None where it is
-            undefined (one chain, or no variance).
-        ess: effective sample size, the smaller one of the same two; None where undefined.
+        rhat: split R-hat, the largest one of log joint, number of partitions and inferred
+            parameters; None where it is undefined (one chain, or no variance).
+        ess: effective sample size, the smallest one of the same; None where undefined.
         chains, draws: number of chains, and of draws kept in each.
         pursuits: those of the mode, in the order of the observations; empty for a model that
             knows none.
