@@ -10,14 +10,13 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from bnirl_ros.errors import InputError
 from bnirl_ros.experiments.make_bags import LAYOUTS
-from bnirl_ros.experiments.overcooked import read_interactions
+from bnirl_ros.experiments.overcooked import add_option, read_interactions
 
 
 def shares(cells: npt.NDArray[np.int64]) -> list[tuple[tuple[int, int], float]]:
@@ -34,14 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="interactions", description="Count from which cells players interact with effect."
     )
-    parser.add_argument(
-        "--overcooked",
-        type=Path,
-        metavar="FOLDER",
-        default=Path("../shared/data/overcooked"),
-        help="human play: <layout>.csv, with a column interact_ok, and <layout>.grid.txt "
-        "(%(default)s)",
-    )
+    add_option(parser)
     options = parser.parse_args(arguments)
     try:
         for layout in LAYOUTS:

@@ -84,13 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="make_bags", description="Make the bags that come with the package."
     )
-    parser.add_argument(
-        "--overcooked",
-        type=Path,
-        metavar="FOLDER",
-        default=Path("../shared/data/overcooked"),
-        help="human play to convert: <layout>.csv and <layout>.grid.txt (%(default)s)",
-    )
+    overcooked.add_option(parser)
     parser.add_argument(
         "--turtle",
         type=Path,

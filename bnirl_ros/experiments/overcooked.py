@@ -14,6 +14,7 @@ observation only where it is an interaction; otherwise its cell is the last pose
 
 from __future__ import annotations
 
+import argparse
 import csv
 from pathlib import Path
 
@@ -87,6 +88,18 @@ _GET_THEM = (
     "it must hold <layout>.csv with the columns episode,t,x,y,action and <layout>.grid.txt, "
     "taken from the train split of the human-human trials in the PyPI package overcooked-ai 1.1.0"
 )
+
+
+def add_option(parser: argparse.ArgumentParser, without: str = "") -> None:
+    """Add --overcooked, the folder with the recordings; `without`: what becomes of the command."""
+    parser.add_argument(
+        "--overcooked",
+        type=Path,
+        metavar="FOLDER",
+        default=Path("../shared/data/overcooked"),
+        help="human play: <layout>.csv, with a column interact_ok, and <layout>.grid.txt"
+        f"{without} (%(default)s)",
+    )
 
 
 def read_overcooked(folder: Path, layout: str) -> tuple[Demonstration, GridMap]:

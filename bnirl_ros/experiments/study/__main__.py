@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from bnirl_ros.errors import InputError
+from bnirl_ros.experiments.overcooked import add_option
 from bnirl_ros.experiments.study import (
     cost,
     kitchens,
@@ -79,14 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="the tables; beside it, with the ending .json, goes what they are made of "
         "(%(default)s)",
     )
-    parser.add_argument(
-        "--overcooked",
-        type=Path,
-        metavar="FOLDER",
-        default=Path("../shared/data/overcooked"),
-        help="human play: <layout>.csv, with a column interact_ok, and <layout>.grid.txt; the "
-        "parts that need it are left out without (%(default)s)",
-    )
+    add_option(parser, "; the parts that need it are left out without")
     options = parser.parse_args(arguments)
     if options.jobs < 1:
         parser.error(f"argument --jobs: must be at least 1, not {options.jobs}")
