@@ -14,10 +14,13 @@ from bnirl_ros.experiments.demonstration_bag import (
     write_demonstration,
     write_what_fits,
 )
-from bnirl_ros.experiments.scenarios import SCENARIOS, Scenario, shipped_demonstration
+from bnirl_ros.experiments.scenarios import PAPER_LOOP, Scenario, shipped_demonstration
 
 SIMULATED_STEP = 0.5
 """Time between two actions of a simulated demonstrator [s]; the paper knows no seconds."""
+
+SIMULATED = (PAPER_LOOP,)
+"""Scenarios whose demonstration is made a bag."""
 
 LAYOUTS = ("random3", "asymmetric_advantages")
 """Layouts of Overcooked-AI whose human play is made a bag."""
@@ -97,7 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     options = parser.parse_args(arguments)
     try:
-        for scenario in SCENARIOS.values():
+        for scenario in SIMULATED:
             bag = make_scenario_bag(scenario, options.out)
             print(f"{bag}: {scenario.episodes} episodes, {bag_size(bag)} bytes")
         for layout in LAYOUTS:
