@@ -13,6 +13,8 @@ import numpy.typing as npt
 
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.maps import GridMap, parse_text_grid
+from bnirl_ros.maps.features import PlaceLayer
+from bnirl_ros.maps.grid_map import FeatureMap
 from bnirl_ros.mdp.finite_mdp import FiniteMDP
 from bnirl_ros.mdp.goal_values import goal_values
 from bnirl_ros.mdp.grid_world import GridWorld
@@ -261,10 +263,11 @@ def draw_reward(scenario: RewardScenario, generator: np.random.Generator) -> Lin
     return LinearReward(sites, weights)
 
 
-def distance_features(world: GridWorld, sites: npt.ArrayLike) -> npt.NDArray[np.int64]:
-    """(S, k) Manhattan distance (21) of every cell of the map from each of the sites (k, 2)."""
-    cells = world.cells_of(np.arange(world.state_count))
-    return np.asarray(np.abs(cells[:, None] - np.asarray(sites, dtype=np.int64)).sum(axis=2))
+def distance_features(grid_map: GridMap, sites: npt.ArrayLike) -> FeatureMap:
+    """Manhattan distance (21) of every cell of a map from each of the sites, cells (k, 2)."""
+    positions = grid_map.centres_of(sites)
+    names = tuple(f"site {number}" for number in range(1, len(positions) + 1))
+    return PlaceLayer(names, positions).features_of(grid_map)
 
 
 def follow_reward(
@@ -272,7 +275,8 @@ def follow_reward(
 ) -> Demonstration:
     """What the demonstrator of section 4.2 does: so many optimal actions, then the last pose."""
     world, process = scenario.world, scenario.process
-    rewards = (distance_features(world, reward.sites) @ reward.weights)[:, None]
+    features = distance_features(scenario.grid_map, reward.sites).coordinates
+    rewards = features.reshape(world.state_count, -1) @ reward.weights[:, None]
     values = optimal_values(process, rewards, _VALUE_TOLERANCE)
     choices = action_values(process, rewards, values, np.arange(world.state_count))[:, :, 0]
     outcomes = world.outcomes()

@@ -1,0 +1,143 @@
+"""The experiments of section 4: which algorithms run on which scenario, how often and how long."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from bnirl_ros.experiments.paper.courses import (
+    ALGORITHMS,
+    BNIRL,
+    Course,
+    Found,
+    Parameters,
+    course_of,
+)
+from bnirl_ros.experiments.paper.trials import trial_of
+from bnirl_ros.experiments.scenarios import (
+    PAPER_FEATURES,
+    PAPER_GRID,
+    PAPER_LOOP,
+    RewardScenario,
+    Scenario,
+)
+
+RUNS = 25
+"""Of every experiment, as in the paper."""
+
+ITERATIONS = 100
+"""Of every algorithm in a run; a Gibbs iteration is a sweep."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Some algorithms, each on so many demonstrations of a scenario.
+
+    Attributes:
+        scenario: what is demonstrated.
+        algorithms: names from `ALGORITHMS`.
+        parameters: of the paper's model.
+        runs: number of demonstrations; run r, from 0, is the same for all algorithms.
+        iterations: of each algorithm.
+    """
+
+    scenario: Scenario | RewardScenario
+    algorithms: tuple[str, ...]
+    parameters: Parameters = field(default_factory=Parameters)
+    runs: int = RUNS
+    iterations: int = ITERATIONS
+
+    @property
+    def jobs(self) -> list[Job]:
+        """One for each algorithm and run, algorithm by algorithm."""
+        return [Job(self, name, run) for name in self.algorithms for run in range(self.runs)]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One algorithm on one demonstration."""
+
+    experiment: Experiment
+    algorithm: str
+    run: int
+
+
+def run_job(job: Job) -> Course:
+    """The course of a job; all that is by chance follows from its run and its algorithm."""
+    experiment = job.experiment
+    generator = np.random.default_rng([job.run, ALGORITHMS.index(job.algorithm)])
+    return course_of(
+        job.algorithm,
+        trial_of(experiment.scenario, job.run),
+        experiment.iterations,
+        generator,
+        experiment.parameters,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """All courses of an experiment.
+
+    Attributes:
+        experiment: what was run.
+        courses: by algorithm, in the order of the runs.
+    """
+
+    experiment: Experiment
+    courses: Mapping[str, Sequence[Course]]
+
+    @classmethod
+    def of(cls, experiment: Experiment, courses: Sequence[Course]) -> Outcome:
+        """From the courses of the experiment's jobs, in their order."""
+        runs = experiment.runs
+        return cls(
+            experiment,
+            {
+                name: courses[number * runs : (number + 1) * runs]
+                for number, name in enumerate(experiment.algorithms)
+            },
+        )
+
+    def losses(self, algorithm: str) -> npt.NDArray[np.float64]:
+        """(runs, T + 1) 0-1 loss at each iteration."""
+        return np.stack([course.loss for course in self.courses[algorithm]])
+
+    def observations(self) -> float:
+        """Mean number of observations of a run."""
+        courses = next(iter(self.courses.values()))
+        return float(np.mean([course.observations for course in courses]))
+
+    def found(self, algorithm: str) -> list[Found]:
+        """What the paper's method found in each run."""
+        return [course.found for course in self.courses[algorithm] if course.found is not None]
+
+
+SECTIONS: dict[str, Experiment] = {
+    "4.1": Experiment(PAPER_GRID, ("BN-IRL State",)),
+    "4.2": Experiment(PAPER_FEATURES, ALGORITHMS),
+    "4.3": Experiment(PAPER_LOOP, ALGORITHMS),
+}
+"""The experiments by section of the paper."""
+
+
+def shortened(experiment: Experiment, runs: int, iterations: int) -> Experiment:
+    """The same with fewer runs and iterations, where it has more."""
+    return replace(
+        experiment,
+        runs=min(runs, experiment.runs),
+        iterations=min(iterations, experiment.iterations),
+    )
+
+
+def variants(algorithms: Sequence[str]) -> list[str]:
+    """Those of some algorithms that are the paper's method."""
+    return [name for name in algorithms if name in BNIRL]
+
+
+def rivals(algorithms: Sequence[str]) -> list[str]:
+    """Those that are not."""
+    return [name for name in algorithms if name not in BNIRL]
