@@ -200,7 +200,7 @@ def _infer(options: argparse.Namespace) -> int:
     remappings = _remappings(options.command, options.remap)
 
     from bnirl_ros.inference.summary import summarise
-    from bnirl_ros.views.plot import import_matplotlib
+    from bnirl_ros.views.map_panel import import_matplotlib
     from bnirl_ros.views.results import check_writable, write_results
     from bnirl_ros.views.tables import report
 

@@ -45,3 +45,10 @@ def colour_of(rank: int) -> Colour:
         for start in (1, 3, 5)
     )
     return red, green, blue
+
+
+def writing_on(colour: Colour) -> Colour:
+    """Ink or white, whichever stands out more (relative luminance of WCAG 2)."""
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in colour]
+    luminance = 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+    return (1.0, 1.0, 1.0) if luminance < 0.26 else INK

@@ -13,8 +13,14 @@ import numpy.typing as npt
 
 from bnirl_ros.inference.summary import Summary
 from bnirl_ros.maps import GridMap
-from bnirl_ros.mdp.actions import STEPS
-from bnirl_ros.views.colours import INK, UNEXPLAINED, Colour, colour_of
+from bnirl_ros.views.colours import INK, UNEXPLAINED, Colour, colour_of, writing_on
+from bnirl_ros.views.map_panel import (
+    ARROWS_FROM,
+    SIGN,
+    draw_free_space,
+    draw_observations,
+    import_matplotlib,
+)
 from bnirl_ros.views.pursuits import unexplained_share
 from bnirl_ros.views.tables import subgoal_columns
 from bnirl_ros.views.ways import Route, Way, route_of
@@ -41,21 +47,10 @@ _COLUMNS = {
 }
 _LETTER = 0.075  # Width of a letter in it [inch].
 
-_BLOCKED: Colour = (0.25, 0.28, 0.33)
-_FREE: Colour = (1.0, 1.0, 1.0)
-_GRID: Colour = (0.92, 0.93, 0.94)
-_ROUTE: Colour = (0.35, 0.38, 0.43)
 _TINT = 0.25  # Opacity of the colour on the cells of a feature subgoal.
 
-_ARROWS_FROM = 9.0  # Cells of this edge have room for arrows; smaller ones get dots [pt].
-_SMALLEST_DOT = 2.6  # Diameter [pt].
 _MOST_NUMBERS = 3  # Numbers on one way.
 _NUMBER = 11.0  # Height of a number's box, and its width unless it is longer [pt].
-
-# An arrow along x from (0, 0) to (1, 0): (along, across as a share of its width) of each corner.
-_ARROW = np.array(
-    [[0.0, 0.5], [0.55, 0.5], [0.55, 1.35], [1.0, 0.0], [0.55, -1.35], [0.55, -0.5], [0.0, -0.5]]
-)
 
 
 @dataclass(frozen=True)
@@ -79,18 +74,6 @@ class _Number:
     text: str
     place: npt.NDArray[np.float64]
     box: npt.NDArray[np.float64]
-
-
-def import_matplotlib() -> tuple[Any, Any]:
-    """matplotlib's Figure and FigureCanvasAgg, imported when first asked for.
-
-    That takes longer than most inferences, so that a caller may want to have it done meanwhile.
-    pyplot is left alone: it would keep every figure, and may look for a screen.
-    """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    return Figure, FigureCanvasAgg
 
 
 def draw_summary(
@@ -136,7 +119,7 @@ def draw_summary(
     )
     _draw_map(axes, grid_map, layout)
     _draw_feature_cells(axes, summary, grid_map)
-    _draw_observations(axes, summary, layout)
+    draw_observations(axes, summary.observations, summary.rank_of, layout.cell)
     numbers = _number_places(summary, route, layout)
     _draw_route(axes, route, numbers, layout)
     _draw_subgoals(axes, summary, numbers, layout)
@@ -169,31 +152,15 @@ def _layout(grid_map: GridMap, legend: tuple[float, float], top: float) -> _Layo
 
 
 def _draw_map(axes: Any, grid_map: GridMap, layout: _Layout) -> None:
+    draw_free_space(axes, grid_map, layout.cell)
     rows, columns = grid_map.free.shape
-    shades = np.rint(255 * np.array([_BLOCKED, _FREE])).astype(np.uint8)
-    axes.imshow(
-        shades[grid_map.free.astype(np.uint8)],
-        origin="lower",
-        extent=(-0.5, columns - 0.5, -0.5, rows - 0.5),
-        interpolation="nearest" if layout.cell >= 2 else "antialiased",
-        aspect="equal",
-    )
-    if layout.cell >= _ARROWS_FROM:
-        axes.vlines(np.arange(columns - 1) + 0.5, -0.5, rows - 0.5, colors=[_GRID], linewidth=0.6)
-        axes.hlines(np.arange(rows - 1) + 0.5, -0.5, columns - 0.5, colors=[_GRID], linewidth=0.6)
     from matplotlib.ticker import MaxNLocator
 
     for axis, cells in ((axes.xaxis, columns), (axes.yaxis, rows)):
         ticks = min(max(int(cells * layout.cell / 50), 1), 8)  # One in 50 points of paper.
         axis.set_major_locator(MaxNLocator(nbins=ticks, integer=True, min_n_ticks=1))
-    axes.tick_params(labelsize=8.5, length=3, color=_ROUTE, labelcolor=INK)
     axes.set_xlabel(f"x [cells of {grid_map.resolution:.4g} m]", fontsize=9, color=INK)
     axes.set_ylabel("y [cells]", fontsize=9, color=INK)
-    axes.set_xlim(-0.5, columns - 0.5)
-    axes.set_ylim(-0.5, rows - 0.5)
-    for spine in axes.spines.values():
-        spine.set_color(_ROUTE)
-        spine.set_linewidth(0.8)
 
 
 def _draw_feature_cells(axes: Any, summary: Summary, grid_map: GridMap) -> None:
@@ -214,77 +181,6 @@ def _draw_feature_cells(axes: Any, summary: Summary, grid_map: GridMap) -> None:
         )
 
 
-def _draw_observations(axes: Any, summary: Summary, layout: _Layout) -> None:
-    keys = np.column_stack([summary.observations[:, 1:], summary.rank_of]).reshape(-1, 4)
-    distinct, counts = np.unique(keys, axis=0, return_counts=True)
-    colours = np.array([colour_of(rank) for rank in distinct[:, 3].tolist()]).reshape(-1, 3)
-    steps = STEPS[distinct[:, 2]]
-    if layout.cell < _ARROWS_FROM:
-        diameter = max(_SMALLEST_DOT, 0.8 * layout.cell)
-        # What is explained lies on top, and there the most frequent one.
-        seen_last = np.lexsort((counts, distinct[:, 3] > 0))
-        axes.scatter(
-            *distinct[seen_last, :2].T,
-            s=diameter**2,
-            c=colours[seen_last],
-            linewidths=0,
-            zorder=3,
-        )
-        return
-    from matplotlib.collections import PolyCollection
-
-    # Where several subgoals share a (cell, action) pair, each next one lies on the one before it
-    # and is slimmer, so that all are seen.
-    turn = _turns(distinct[:, :3], counts)
-    width = np.sqrt(counts / counts.max(initial=1)) * 0.6**turn
-    moves = steps.any(axis=1)
-    for layer in range(turn.max(initial=-1) + 1):
-        move, stay = moves & (turn == layer), ~moves & (turn == layer)
-        outlines = _arrows(distinct[move, :2], steps[move], 0.04 + 0.16 * width[move])
-        axes.add_collection(
-            PolyCollection(
-                list(outlines),
-                facecolors=colours[move],
-                edgecolors="white",
-                linewidths=0.3,
-                zorder=3,
-            )
-        )
-        axes.scatter(
-            *distinct[stay, :2].T,
-            s=((0.14 + 0.26 * width[stay]) * layout.cell) ** 2,
-            c=colours[stay],
-            edgecolors="white",
-            linewidths=0.3,
-            zorder=3.1,
-        )
-
-
-def _turns(pairs: npt.NDArray[np.int64], counts: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """For each of the sorted pairs (N, 3) its place among its equals, the most frequent first."""
-    new = np.ones(len(pairs), dtype=bool)
-    new[1:] = (pairs[1:] != pairs[:-1]).any(axis=1)
-    group = np.cumsum(new) - 1
-    order = np.lexsort((-counts, group))
-    turn = np.empty(len(pairs), dtype=np.int64)
-    turn[order] = np.arange(len(pairs)) - np.flatnonzero(new)[group]
-    return turn
-
-
-def _arrows(
-    cells: npt.NDArray[np.int64], steps: npt.NDArray[np.int64], widths: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
-    """Outlines (N, 7, 2) [cells] of arrows from the cells (N, 2) along their steps (N, 2)."""
-    length = np.linalg.norm(steps, axis=1, keepdims=True)
-    along = steps / length
-    across = np.column_stack([-along[:, 1], along[:, 0]])
-    return np.asarray(
-        cells[:, np.newaxis, :]
-        + 0.46 * _ARROW[:, :1] * (along * np.sqrt(length))[:, np.newaxis, :]
-        + _ARROW[:, 1:] * (across * widths[:, np.newaxis])[:, np.newaxis, :]
-    )
-
-
 def _draw_route(axes: Any, route: Route, numbers: Sequence[_Number], layout: _Layout) -> None:
     from matplotlib.patches import FancyArrowPatch
     from matplotlib.patheffects import withStroke
@@ -302,7 +198,7 @@ def _draw_route(axes: Any, route: Route, numbers: Sequence[_Number], layout: _La
                 shrinkB=_marker(layout) / 2 + 2,
                 linewidth=width,
                 linestyle=(0, (4, 2)),
-                color=_ROUTE,
+                color=SIGN,
                 alpha=opacity,
                 path_effects=[
                     withStroke(linewidth=width + 1.7, foreground="white", alpha=0.6 * opacity)
@@ -391,13 +287,13 @@ def _write_order(axes: Any, place: npt.NDArray[np.float64], text: str) -> None:
         *place,
         text,
         fontsize=7,
-        color=_ROUTE,
+        color=SIGN,
         horizontalalignment="center",
         verticalalignment="center_baseline",
         bbox={
             "boxstyle": "circle,pad=0.18" if len(text) < 3 else "round,pad=0.18,rounding_size=0.6",
             "facecolor": "white",
-            "edgecolor": _ROUTE,
+            "edgecolor": SIGN,
             "linewidth": 0.7,
         },
         zorder=4.5,
@@ -435,7 +331,7 @@ def _draw_subgoals(
             verticalalignment="center_baseline",
             fontsize=0.52 * size,
             fontweight="bold",
-            color=_writing_on(colour),
+            color=writing_on(colour),
             zorder=6,
         )
         axes.annotate(
@@ -450,13 +346,6 @@ def _draw_subgoals(
             path_effects=[withStroke(linewidth=2.6, foreground="white")],
             zorder=7,
         )
-
-
-def _writing_on(colour: Colour) -> Colour:
-    """Ink or white, whichever stands out more (relative luminance of WCAG 2)."""
-    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in colour]
-    luminance = 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
-    return (1.0, 1.0, 1.0) if luminance < 0.26 else INK
 
 
 def _tag_places(
@@ -506,7 +395,7 @@ def _draw_legend(
             y,
             text,
             fontsize=8.5,
-            color=_ROUTE if faint else INK,
+            color=SIGN if faint else INK,
             horizontalalignment="right" if right else "left",
             verticalalignment="center_baseline",
         )
@@ -531,7 +420,7 @@ def _draw_legend(
             str(subgoal.rank),
             fontsize=7.5,
             fontweight="bold",
-            color=_writing_on(colour),
+            color=writing_on(colour),
             horizontalalignment="center",
             verticalalignment="center_baseline",
         )
@@ -547,7 +436,7 @@ def _draw_legend(
             xytext=(sign - 0.22, y),
             arrowprops={
                 "arrowstyle": "-|>,head_length=0.35,head_width=0.2",
-                "color": _ROUTE,
+                "color": SIGN,
                 "linewidth": 1.3,
             },
         )
@@ -555,7 +444,7 @@ def _draw_legend(
         write(sign + _KEY, y, route.order)
         y += _LEGEND_LINE
     if route.wide:
-        legend.plot([sign - 0.2, sign + 0.2], [y, y], color=_ROUTE, linewidth=_widest(route))
+        legend.plot([sign - 0.2, sign + 0.2], [y, y], color=SIGN, linewidth=_widest(route))
         write(sign + _KEY, y, "the wider, the more often")
         y += _LEGEND_LINE
     dot(y, colour_of(1), 4)
@@ -572,6 +461,6 @@ def _column_width(name: str, texts: Sequence[str]) -> float:
 
 
 def _key_of_observations(layout: _Layout) -> str:
-    if layout.cell < _ARROWS_FROM:
+    if layout.cell < ARROWS_FROM:
         return "an observation, in its subgoal's colour"
     return "observed: dot for stay, arrow for a move"
