@@ -100,7 +100,9 @@ def true_subgoals(trial: Trial, variant: str) -> set[tuple[int, ...]]:
     return {tuple(trial.features.coordinates[y, x].tolist()) for x, y in trial.truth}
 
 
-def unmatched(values: npt.NDArray[np.float64], positions: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+def unmatched(
+    values: npt.NDArray[np.float64], positions: npt.NDArray[np.int64]
+) -> npt.NDArray[np.bool_]:
     """Whether the demonstrated action is none of the greedy ones: the 0-1 loss of an observation.
 
     An action is greedy when its value is within `TIE` of the best, so that exact ties, which
