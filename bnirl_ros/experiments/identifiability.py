@@ -47,10 +47,9 @@ def detours(scenario: Scenario) -> list[float]:
     """How many steps more the way to another subgoal takes over each subgoal than straight.
 
     From where the demonstrator begins to pursue it, and to that one of the others where this is
-    the least. A way's length is the
-    certain number of steps that is worth as much as the uncertain one, log h / log gamma with the
-    discounted first-passage value h. 0 means that the subgoal lies on a shortest way to another
-    one, which explains as well what is done on the way to it.
+    the least. A way's length is the certain number of steps that is worth as much as the uncertain
+    one, log h / log gamma with the discounted first-passage value h. 0 means that the subgoal lies
+    on a shortest way to another one, which explains as well what is done on the way to it.
     """
     world = scenario.world
     goals = world.states_of(scenario.subgoals)

@@ -117,6 +117,11 @@ def paper_cell(x: int, y: int) -> Cell:
     return x - 1, y - 1
 
 
+def number_of(cell: Cell) -> Cell:
+    """The paper's numbers of one of our cells."""
+    return cell[0] + 1, cell[1] + 1
+
+
 PAPER_LOOP = Scenario(
     name="paper_loop",
     section="4.3",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -75,6 +76,7 @@ def draw_observations(
     observations: npt.NDArray[np.int64],
     rank_of: npt.NDArray[np.int64],
     cell: float,
+    colour: Callable[[int], Colour] = colour_of,
 ) -> None:
     """Each distinct (cell, action) pair in the colour of the subgoal that it is assigned to.
 
@@ -86,10 +88,11 @@ def draw_observations(
         observations: (N, 4) episode, x, y, action index.
         rank_of: (N,) rank of each one's subgoal; 0 for none.
         cell: edge of a cell on paper [pt].
+        colour: of a rank.
     """
     keys = np.column_stack([observations[:, 1:], rank_of]).reshape(-1, 4)
     distinct, counts = np.unique(keys, axis=0, return_counts=True)
-    colours = np.array([colour_of(rank) for rank in distinct[:, 3].tolist()]).reshape(-1, 3)
+    colours = np.array([colour(rank) for rank in distinct[:, 3].tolist()]).reshape(-1, 3)
     steps = STEPS[distinct[:, 2]]
     if cell < ARROWS_FROM:
         diameter = max(_SMALLEST_DOT, 0.8 * cell)

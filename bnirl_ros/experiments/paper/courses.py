@@ -8,10 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from bnirl_ros.baselines import RIVALS, Observed, PolicyWalk, Rival
 from bnirl_ros.experiments.paper.trials import (
     Trial,
     candidate_subgoals,
     goal_losses,
+    reward_losses,
     true_subgoals,
 )
 from bnirl_ros.inference import partition_gibbs
@@ -21,6 +23,13 @@ from bnirl_ros.model.mixture import SubgoalMixture, subgoal_mixture
 
 BNIRL = {"BN-IRL State": "State", "BN-IRL Feature": "Feature"}
 """The variants of the paper's method, by their names in its figures."""
+
+RIVAL_NAMES = {
+    "Abbeel IRL": "abbeel_ng",
+    "MaxMargin IRL": "max_margin",
+    "Bayesian IRL": "policy_walk",
+}
+"""The algorithms that it is compared with, by their names there."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +183,29 @@ def _subgoals(
     return tuple(tuple(coordinates) for coordinates in chosen)
 
 
-ALGORITHMS = (*BNIRL,)
+def rival_of(trial: Trial, name: str, generator: np.random.Generator) -> Rival:
+    """One of the `RIVAL_NAMES`, initialised on a trial."""
+    given = (trial.process, Observed.of(trial.demonstration, trial.world), trial.feature_matrix)
+    rival = RIVALS[RIVAL_NAMES[name]]
+    return rival(*given, generator) if issubclass(rival, PolicyWalk) else rival(*given)
+
+
+def rival_course(
+    trial: Trial, name: str, iterations: int, generator: np.random.Generator
+) -> Course:
+    """An algorithm that explains everything by one reward; its loss is that of its last answer."""
+    rival = rival_of(trial, name, generator)
+    losses, known = [np.nan], None
+    for _ in range(iterations):
+        estimate = rival.iterate()
+        if estimate is not known:  # one that has ended gives the same answer again and again
+            known = estimate
+            lost = reward_losses(trial, estimate.reward, estimate.action_values)
+        losses.append(float(lost.sum()))
+    return Course(len(trial.demonstration), np.array(losses, dtype=np.float64))
+
+
+ALGORITHMS = (*BNIRL, *RIVAL_NAMES)
 """All algorithms, by their names in the paper's figures."""
 
 
@@ -186,4 +217,6 @@ def course_of(
     parameters: Parameters,
 ) -> Course:
     """The course of one of `ALGORITHMS` over a trial; the parameters are of the paper's model."""
-    return bnirl_course(trial, BNIRL[algorithm], iterations, generator, parameters)
+    if algorithm in BNIRL:
+        return bnirl_course(trial, BNIRL[algorithm], iterations, generator, parameters)
+    return rival_course(trial, algorithm, iterations, generator)

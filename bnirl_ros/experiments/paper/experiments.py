@@ -68,14 +68,18 @@ class Job:
 def run_job(job: Job) -> Course:
     """The course of a job; all that is by chance follows from its run and its algorithm."""
     experiment = job.experiment
-    generator = np.random.default_rng([job.run, ALGORITHMS.index(job.algorithm)])
     return course_of(
         job.algorithm,
         trial_of(experiment.scenario, job.run),
         experiment.iterations,
-        generator,
+        generator_of(job.run, job.algorithm),
         experiment.parameters,
     )
+
+
+def generator_of(run: int, algorithm: str) -> np.random.Generator:
+    """The source of an algorithm's randomness in a run."""
+    return np.random.default_rng([run, ALGORITHMS.index(algorithm)])
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,6 +23,7 @@ from bnirl_ros.mdp.finite_mdp import FiniteMDP
 from bnirl_ros.mdp.goal_values import goal_values
 from bnirl_ros.mdp.goals import Goals
 from bnirl_ros.mdp.grid_world import GridWorld
+from bnirl_ros.mdp.reward_values import action_values, optimal_values
 from bnirl_ros.model.candidates import Candidates, candidates_of
 
 VALUE_TOLERANCE = 1e-10
@@ -125,3 +126,25 @@ def goal_losses(trial: Trial, goals: Goals) -> npt.NDArray[np.bool_]:
     visited, index = np.unique(trial.states, return_inverse=True)
     values = goal_values(trial.process, goals, visited, VALUE_TOLERANCE)
     return unmatched(values[index], trial.positions)
+
+
+def reward_losses(
+    trial: Trial, reward: npt.NDArray[np.float64], nearly: npt.NDArray[np.float64]
+) -> npt.NDArray[np.bool_]:
+    """(N,) 0-1 loss of each observation under one reward for all.
+
+    The reward is scaled so that its range is 1, as that of a subgoal is: `TIE` then means the same
+    for every algorithm, whose rewards come in units of their own.
+
+    Args:
+        trial: the run.
+        reward: (S,) R(s).
+        nearly: (S, A) action values under it, to a tolerance that may be larger than `TIE`.
+    """
+    reached = reward[trial.world.free.reshape(-1)]
+    scale = float(np.ptp(reached)) or 1.0  # a constant reward is for any action
+    rewards, start = reward[:, None] / scale, nearly.max(axis=1, keepdims=True) / scale
+    values = optimal_values(trial.process, rewards, VALUE_TOLERANCE, start)
+    visited, index = np.unique(trial.states, return_inverse=True)
+    found = action_values(trial.process, rewards, values, visited)[:, :, 0]
+    return unmatched(found[index], trial.positions)
