@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,13 +13,15 @@ from bnirl_ros.baselines import RIVALS, Observed, PolicyWalk, Rival
 from bnirl_ros.experiments.paper.trials import (
     Trial,
     candidate_subgoals,
-    goal_losses,
+    goal_values_of,
     reward_losses,
     true_subgoals,
+    unmatched,
 )
 from bnirl_ros.inference import partition_gibbs
 from bnirl_ros.inference.mode import Mode, ascend
 from bnirl_ros.model.candidates import Candidates
+from bnirl_ros.model.likelihood import value_losses
 from bnirl_ros.model.mixture import SubgoalMixture, subgoal_mixture
 
 BNIRL = {"BN-IRL State": "State", "BN-IRL Feature": "Feature"}
@@ -58,6 +61,9 @@ class Found:
         mode_loss: 0-1 loss.
         best_subgoals, mode_subgoals: cells, or feature coordinates, in ascending order.
         best_exact, mode_exact: whether those are exactly the true ones.
+        least_loss: 0-1 loss were each observation assigned to the candidate that suits it best.
+        unmatched_cost: how much less likely (7) makes the actions that count as lost in the best
+            sample than the greedy ones, on average [nats]; NaN where there are none.
     """
 
     sample_loss: npt.NDArray[np.int64]
@@ -68,6 +74,8 @@ class Found:
     mode_subgoals: tuple[tuple[int, ...], ...]
     best_exact: bool
     mode_exact: bool
+    least_loss: int
+    unmatched_cost: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,8 +162,12 @@ def bnirl_course(
     mixture = mixture_of(trial, candidates, parameters)
     samples = sample(mixture, iterations, generator)
     best, mode = empirical_mode(mixture, samples)
-    lost = goal_losses(trial, candidates.goals)
+    values = goal_values_of(trial, candidates.goals)
+    lost = unmatched(values, trial.positions)
     everyone = np.arange(len(lost))
+    best_lost = np.flatnonzero(lost[everyone, samples.subgoal_of[best]])
+    shortfall = value_losses(values)[everyone, trial.positions]  # (N, G)
+    costs = parameters.alpha * shortfall[best_lost, samples.subgoal_of[best][best_lost]]
     sample_loss = lost[everyone, samples.subgoal_of].sum(axis=1)
     truth = true_subgoals(trial, variant)
     best_subgoals = _subgoals(candidates, samples.subgoal_of[best])
@@ -172,6 +184,8 @@ def bnirl_course(
             mode_subgoals=mode_subgoals,
             best_exact=set(best_subgoals) == truth,
             mode_exact=set(mode_subgoals) == truth,
+            least_loss=int(lost.min(axis=1).sum()),
+            unmatched_cost=float(costs.mean()) if len(costs) else math.nan,
         ),
     )
 

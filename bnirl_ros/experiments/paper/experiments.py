@@ -31,6 +31,9 @@ RUNS = 25
 ITERATIONS = 100
 """Of every algorithm in a run; a Gibbs iteration is a sweep."""
 
+LAST = 10
+"""Iterations at the end over whose mean an algorithm's final loss is taken."""
+
 
 @dataclass(frozen=True)
 class Experiment:
@@ -109,6 +112,14 @@ class Outcome:
     def losses(self, algorithm: str) -> npt.NDArray[np.float64]:
         """(runs, T + 1) 0-1 loss at each iteration."""
         return np.stack([course.loss for course in self.courses[algorithm]])
+
+    def final_losses(self, algorithm: str) -> npt.NDArray[np.float64]:
+        """(runs,) 0-1 loss after the last iteration.
+
+        That of a single iteration says little of an algorithm that goes up and down, so it is the
+        mean over the last `LAST` of them.
+        """
+        return np.asarray(self.losses(algorithm)[:, 1:][:, -LAST:].mean(axis=1))
 
     def observations(self) -> float:
         """Mean number of observations of a run."""

@@ -121,11 +121,10 @@ def unmatched(
     return np.asarray(demonstrated < values.max(axis=1) - TIE)
 
 
-def goal_losses(trial: Trial, goals: Goals) -> npt.NDArray[np.bool_]:
-    """(N, G) 0-1 loss of each observation, were each goal its subgoal."""
+def goal_values_of(trial: Trial, goals: Goals) -> npt.NDArray[np.float64]:
+    """(N, A, G) values of all actions in the state of each observation, for each goal."""
     visited, index = np.unique(trial.states, return_inverse=True)
-    values = goal_values(trial.process, goals, visited, VALUE_TOLERANCE)
-    return unmatched(values[index], trial.positions)
+    return goal_values(trial.process, goals, visited, VALUE_TOLERANCE)[index]
 
 
 def reward_losses(

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bnirl_ros.demonstrations.demonstration import Demonstration
+from bnirl_ros.experiments.machine import one_core
 from bnirl_ros.experiments.study.part import MODELS, SEED, Part, settings_of
 from bnirl_ros.experiments.study.report import Table
 from bnirl_ros.experiments.study.simulated import Demonstrator, demonstrate
@@ -42,20 +41,6 @@ def long_demonstration() -> Demonstration:
         last_episode=whole.last_episode[ended],
         last_cells=whole.last_cells[ended],
     )
-
-
-@contextmanager
-def one_core() -> Iterator[None]:
-    """On one core meanwhile, where the system can be told so."""
-    if not hasattr(os, "sched_setaffinity"):
-        yield
-        return
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(before)})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, before)
 
 
 def run(model: str) -> dict[str, Any]:
