@@ -6,8 +6,8 @@ import argparse
 import gc
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from threading import Thread
@@ -26,6 +26,10 @@ if TYPE_CHECKING:  # what a command needs is imported when it runs, so that --he
     from bnirl_ros.inference.settings import Settings
     from bnirl_ros.maps.grid_map import GridMap
     from bnirl_ros.views.predictions import Foreseen
+
+
+REPRODUCIBLE = ("4.1", "4.2", "4.3", "table1", "all")
+"""What `bnirl reproduce` can be asked for."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -93,6 +97,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     predict.set_defaults(run=_predict, command=predict)
 
+    _add_reproduce(commands.add_parser("reproduce", help="run the paper's experiments again"))
+
     commands.add_parser("replay", help="play a recorded demonstration onto its topics")
 
     demo = commands.add_parser("demo", help="watch a human demonstration become subgoals")
@@ -139,6 +145,46 @@ def _add_inference(parser: argparse.ArgumentParser) -> None:
         metavar="SECONDS",
         help="longest time between two poses of one episode (%(default)s)",
     )
+
+
+def _add_reproduce(parser: argparse.ArgumentParser) -> None:
+    """The options of `bnirl reproduce`."""
+    from bnirl_ros.inference.settings import PAPER_PARAMETERS, above_zero, one_or_more
+
+    parser.description = (
+        "Run the experiments of section 4 of Michini and How (2012) and the times of its Table 1, "
+        "and tell what holds: on the terminal, and with figures and tables in reproduction.md."
+    )
+    parser.add_argument(
+        "part",
+        nargs="?",
+        choices=REPRODUCIBLE,
+        default="all",
+        help="a section or the table (%(default)s)",
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("bnirl_out"), help="folder for the results (%(default)s)"
+    )
+    for name, what in (("alpha", "confidence of (7)"), ("eta", "concentration of (5)")):
+        parser.add_argument(
+            f"--{name}",
+            type=above_zero,
+            default=PAPER_PARAMETERS[name],
+            help=f"{what}, above 0; the paper does not print it (%(default)s)",
+        )
+    parser.add_argument(
+        "--runs", type=one_or_more, default=25, help="of each experiment (%(default)s)"
+    )
+    parser.add_argument(
+        "--iterations", type=one_or_more, default=100, help="of each algorithm (%(default)s)"
+    )
+    parser.add_argument(
+        "--jobs",
+        type=one_or_more,
+        default=os.cpu_count() or 1,
+        help="how many run at the same time; the results are the same (%(default)s)",
+    )
+    parser.set_defaults(run=_reproduce, command=parser)
 
 
 def _cell(text: str) -> tuple[int, int]:
@@ -323,8 +369,8 @@ def _inferred(demonstration: Demonstration, grid_map: GridMap, settings: Setting
     """The posterior, with a progress bar on the way."""
     from bnirl_ros.inference.posterior import infer
 
-    with ExitStack() as stack:
-        progress = _progress(stack, settings.sweeps * settings.chains)
+    total = settings.sweeps * settings.chains
+    with _progress("Sampling", total, before="Solving the goals") as progress:
         return infer(demonstration, grid_map, settings, progress)
 
 
@@ -332,6 +378,28 @@ def _told_of(damage: str | None) -> int:
     """Exit status 0, unless a file was damaged, which is told last."""
     if damage:
         raise InputError(f"{damage}; the results are from what could be read")
+    return 0
+
+
+def _reproduce(options: argparse.Namespace) -> int:
+    """`bnirl reproduce`: the paper's experiments, and what holds of what it says of them."""
+    from bnirl_ros.experiments.paper.courses import Parameters
+    from bnirl_ros.experiments.paper.page import files_of, short
+    from bnirl_ros.experiments.paper.reproduce import PARTS, Plan, reproduce
+    from bnirl_ros.views.results import check_writable
+
+    check_writable(options.out)
+    gc.enable()  # this may run for long
+    plan = Plan(
+        parts=PARTS if options.part == "all" else (options.part,),
+        runs=options.runs,
+        iterations=options.iterations,
+        parameters=Parameters(options.alpha, options.eta),
+        processes=options.jobs,
+    )
+    report = reproduce(plan, options.out, _progress)
+    print(short(report.claims))
+    print(f"Written: {', '.join(str(options.out / name) for name in files_of(report))}")
     return 0
 
 
@@ -410,10 +478,20 @@ def _placed(
     return placement.demonstration, grid_map, recorded.damage
 
 
-def _progress(stack: ExitStack, total: int) -> Callable[[int], None] | None:
-    """A progress bar on a terminal's standard error, told of sweeps; nothing elsewhere."""
+@contextmanager
+def _progress(
+    doing: str, total: int, before: str | None = None
+) -> Iterator[Callable[[int], None] | None]:
+    """A progress bar on a terminal's standard error; nothing elsewhere.
+
+    Args:
+        doing: what is done.
+        total: in how many steps; whoever does it tells how many more are done.
+        before: what is done until the first ones are, if that is something else.
+    """
     if not sys.stderr.isatty():
-        return None
+        yield None
+        return
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -423,22 +501,20 @@ def _progress(stack: ExitStack, total: int) -> Callable[[int], None] | None:
         TimeElapsedColumn,
     )
 
-    bar = stack.enter_context(
-        Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TaskProgressColumn(),
-            TimeElapsedColumn(),
-            console=Console(stderr=True),
-            transient=True,
-        )
-    )
-    task = bar.add_task("Solving the goals", total=None)
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+        console=Console(stderr=True),
+        transient=True,
+    ) as bar:
+        task = bar.add_task(before or doing, total=None if before else total)
 
-    def advance(sweeps: int) -> None:
-        bar.update(task, description="Sampling", total=total, advance=sweeps)
+        def advance(steps: int) -> None:
+            bar.update(task, description=doing, total=total, advance=steps)
 
-    return advance
+        yield advance
 
 
 def _warn(sentence: str) -> None:

@@ -185,9 +185,9 @@ PAPER_GRID = Scenario(
     # The walls of 4.1 and 4.2 are our choice, too, off the ways between the subgoals. Those of
     # 4.3 would not do: the subgoal (10, 12) of the paper is one of their blocked cells.
     grid=_GRID,
-    # So is the start, and that there is one demonstration: it makes about 50 observations, as many
-    # as the loss in the paper's Figure 3 reaches. Every subgoal is a turn for who starts here; for
-    # how it is for others, see `identifiability`.
+    # So is the start, and that there is one demonstration: it makes about 50 observations, where
+    # the axis of the loss in the paper's Figure 3 ends. Every subgoal is a turn for who starts
+    # here; for how it is for others, see `identifiability`.
     start=paper_cell(2, 2),
     subgoals=(paper_cell(10, 12), paper_cell(2, 17), paper_cell(2, 2)),
     episodes=1,

@@ -67,7 +67,7 @@ def write_whole(folder: Path, writers: Mapping[str, Callable[[Path], object]]) -
             finally:
                 partial.unlink(missing_ok=True)
     except OSError as error:
-        raise _unwritable(folder, error) from error
+        raise unwritable(folder, error) from error
     return [folder / name for name in writers]
 
 
@@ -84,10 +84,11 @@ def check_writable(folder: Path) -> None:
         with TemporaryFile(dir=place):
             pass
     except OSError as error:
-        raise _unwritable(folder, error) from error
+        raise unwritable(folder, error) from error
 
 
-def _unwritable(folder: Path, error: OSError) -> InputError:
+def unwritable(folder: Path, error: OSError) -> InputError:
+    """What to tell of a folder into which results cannot be written."""
     return InputError(
         f"{folder}: the results cannot be written there ({error.strerror}); choose another folder"
     )

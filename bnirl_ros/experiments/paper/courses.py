@@ -20,6 +20,7 @@ from bnirl_ros.experiments.paper.trials import (
 )
 from bnirl_ros.inference import partition_gibbs
 from bnirl_ros.inference.mode import Mode, ascend
+from bnirl_ros.inference.settings import PAPER_PARAMETERS
 from bnirl_ros.model.candidates import Candidates
 from bnirl_ros.model.likelihood import value_losses
 from bnirl_ros.model.mixture import SubgoalMixture, subgoal_mixture
@@ -44,8 +45,8 @@ class Parameters:
         eta: concentration of (5).
     """
 
-    alpha: float = 50.0
-    eta: float = 1.0
+    alpha: float = PAPER_PARAMETERS["alpha"]
+    eta: float = PAPER_PARAMETERS["eta"]
 
 
 @dataclass(frozen=True, eq=False)

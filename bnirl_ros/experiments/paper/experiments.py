@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -56,27 +56,44 @@ class Experiment:
     @property
     def jobs(self) -> list[Job]:
         """One for each algorithm and run, algorithm by algorithm."""
-        return [Job(self, name, run) for name in self.algorithms for run in range(self.runs)]
+        return [
+            Job(
+                self.scenario,
+                name,
+                run,
+                self.iterations,
+                # What it does not depend on must not tell it from another job.
+                self.parameters if name in BNIRL else Parameters(),
+            )
+            for name in self.algorithms
+            for run in range(self.runs)
+        ]
 
 
 @dataclass(frozen=True)
 class Job:
-    """One algorithm on one demonstration."""
+    """One algorithm on one demonstration; equal jobs have equal courses.
 
-    experiment: Experiment
+    Attributes:
+        scenario, algorithm, iterations, parameters: as in `Experiment`.
+        run: number of the demonstration.
+    """
+
+    scenario: Scenario | RewardScenario
     algorithm: str
     run: int
+    iterations: int
+    parameters: Parameters
 
 
 def run_job(job: Job) -> Course:
     """The course of a job; all that is by chance follows from its run and its algorithm."""
-    experiment = job.experiment
     return course_of(
         job.algorithm,
-        trial_of(experiment.scenario, job.run),
-        experiment.iterations,
+        trial_of(job.scenario, job.run),
+        job.iterations,
         generator_of(job.run, job.algorithm),
-        experiment.parameters,
+        job.parameters,
     )
 
 
@@ -98,16 +115,12 @@ class Outcome:
     courses: Mapping[str, Sequence[Course]]
 
     @classmethod
-    def of(cls, experiment: Experiment, courses: Sequence[Course]) -> Outcome:
-        """From the courses of the experiment's jobs, in their order."""
-        runs = experiment.runs
-        return cls(
-            experiment,
-            {
-                name: courses[number * runs : (number + 1) * runs]
-                for number, name in enumerate(experiment.algorithms)
-            },
-        )
+    def of(cls, experiment: Experiment, courses: Mapping[Job, Course]) -> Outcome:
+        """From the courses of the experiment's jobs, others among them or not."""
+        by_algorithm: dict[str, list[Course]] = {name: [] for name in experiment.algorithms}
+        for job in experiment.jobs:
+            by_algorithm[job.algorithm].append(courses[job])
+        return cls(experiment, by_algorithm)
 
     def losses(self, algorithm: str) -> npt.NDArray[np.float64]:
         """(runs, T + 1) 0-1 loss at each iteration."""
@@ -137,15 +150,6 @@ SECTIONS: dict[str, Experiment] = {
     "4.3": Experiment(PAPER_LOOP, ALGORITHMS),
 }
 """The experiments by section of the paper."""
-
-
-def shortened(experiment: Experiment, runs: int, iterations: int) -> Experiment:
-    """The same with fewer runs and iterations, where it has more."""
-    return replace(
-        experiment,
-        runs=min(runs, experiment.runs),
-        iterations=min(iterations, experiment.iterations),
-    )
 
 
 def variants(algorithms: Sequence[str]) -> list[str]:
