@@ -194,7 +194,7 @@ def _loss_in_words(name: str, outcome: Outcome) -> str:
     share = final.mean() / outcome.observations()
     return (
         f"{final.mean():.1f} of {outcome.observations():.0f} ({share:.0%}; "
-        f"in the runs {low:.0f} to {high:.0f})"
+        f"{low:.0f} to {high:.0f} in the runs)"
     )
 
 

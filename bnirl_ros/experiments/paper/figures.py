@@ -5,7 +5,7 @@ Cells are numbered as in the paper, from 1.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,8 +26,8 @@ from bnirl_ros.views.map_panel import SIGN, draw_free_space, draw_observations, 
 FIGURES = {"4.1": "figure_3", "4.2": "figure_4", "4.3": "figure_5"}
 """File names, without ending, of the paper's figures by section."""
 
-BAND = (10, 90)
-"""Percentiles of the runs between which the band of a loss lies."""
+BAND = 2.0
+"""Half the width of a mean loss's band, in its standard errors: about 95 % for the mean."""
 
 # By algorithm: rank of its colour, line style, and the marker on its line. Colours alone would
 # not do in a print without colours.
@@ -52,7 +52,8 @@ class Assignment:
     Attributes:
         title: what it is.
         subgoals: their cells, in the order of their ranks.
-        rank_of: (N,) rank of each observation's subgoal; those with most observations come first.
+        rank_of: (N,) rank of each observation's subgoal: true ones in the order in which they are
+            pursued, so that they have the same colour in every picture, then others.
     """
 
     title: str
@@ -70,7 +71,7 @@ def assignments(experiment: Experiment, run: int) -> list[Assignment]:
     best = int(samples.log_joint.argmax())
     mode = ascend(mixture, samples.partition_of[best], samples.subgoal_of[best])
     return [
-        _assignment(title, candidates.coordinates, subgoal_of)
+        _assignment(title, candidates.coordinates, subgoal_of, trial.truth)
         for title, subgoal_of in (
             (f"Best of {experiment.iterations} samples", samples.subgoal_of[best]),
             ("Posterior mode", mode.subgoal_of),
@@ -79,13 +80,17 @@ def assignments(experiment: Experiment, run: int) -> list[Assignment]:
 
 
 def _assignment(
-    title: str, cells: npt.NDArray[np.int64], subgoal_of: npt.NDArray[np.int32]
+    title: str,
+    cells: npt.NDArray[np.int64],
+    subgoal_of: npt.NDArray[np.int32],
+    truth: Sequence[Cell],
 ) -> Assignment:
     chosen, index, counts = np.unique(subgoal_of, return_inverse=True, return_counts=True)
-    by_rank = np.argsort(-counts, kind="stable")
-    rank_of = np.argsort(by_rank)[index] + 1
-    subgoals = tuple((int(x), int(y)) for x, y in cells[chosen[by_rank]])
-    return Assignment(title, subgoals, rank_of)
+    found = [(int(x), int(y)) for x, y in cells[chosen]]
+    place = {cell: number for number, cell in enumerate(truth)}
+    order = sorted(range(len(found)), key=lambda n: (place.get(found[n], len(truth)), -counts[n]))
+    rank_of = (np.argsort(order) + 1)[index]
+    return Assignment(title, tuple(found[number] for number in order), rank_of)
 
 
 def draw_figure(section: str, outcome: Outcome, folder: Path) -> list[Path]:
@@ -110,7 +115,7 @@ def draw_figure(section: str, outcome: Outcome, folder: Path) -> list[Path]:
     width, height = _LEFT + _PANEL + _RIGHT, _BOTTOM + _PANEL + _TOP
     size = (columns * width, rows * height)
     figure = figure_class(figsize=size, dpi=_DOTS_PER_INCH, facecolor="white")
-    canvas = canvas_class(figure)
+    canvas_class(figure)
     for number, draw in enumerate(drawers):
         row, column = divmod(number, columns)
         left = (column * width + _LEFT) / size[0]
@@ -124,7 +129,6 @@ def draw_figure(section: str, outcome: Outcome, folder: Path) -> list[Path]:
         strict=True,
     ):
         figure.savefig(file, metadata=metadata)
-    del canvas
     return files
 
 
@@ -243,20 +247,31 @@ def _tag(
     )
 
 
+def standard_error(losses: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """(T,) standard error of the mean over runs of losses (runs, T); 0 for a single run."""
+    runs = len(losses)
+    if runs == 1:
+        return np.zeros(losses.shape[1])
+    return np.asarray(losses.std(axis=0, ddof=1) / np.sqrt(runs))
+
+
 def _draw_losses(axes: Any, outcome: Outcome) -> None:
     experiment = outcome.experiment
     iterations = np.arange(experiment.iterations + 1)
     highest = 0.0
+    alone = len(experiment.algorithms) == 1
     for name in experiment.algorithms:
         rank, style, marker = _LINES[name]
         colour = colour_of(rank)
         losses = outcome.losses(name)
         known = ~np.isnan(losses).any(axis=0)
-        low, high = np.percentile(losses[:, known], BAND, axis=0)
-        axes.fill_between(iterations[known], low, high, color=colour, alpha=0.13, linewidth=0)
+        mean = losses[:, known].mean(axis=0)
+        half = BAND * standard_error(losses[:, known])
+        low, high = np.maximum(mean - half, 0.0), mean + half
+        axes.fill_between(iterations[known], low, high, color=colour, alpha=0.16, linewidth=0)
         axes.plot(
             iterations[known],
-            losses[:, known].mean(axis=0),
+            mean,
             color=colour,
             linestyle=style,
             linewidth=1.6,
@@ -265,10 +280,10 @@ def _draw_losses(axes: Any, outcome: Outcome) -> None:
             markersize=4.5,
             markeredgecolor="white",
             markeredgewidth=0.5,
-            label=name,
+            label=f"{name}, best sample so far" if alone else name,
         )
         highest = max(highest, float(high.max()))
-    if len(experiment.algorithms) == 1:
+    if alone:
         (name,) = experiment.algorithms
         drawn = np.stack([found.sample_loss for found in outcome.found(name)])
         axes.plot(
@@ -286,8 +301,8 @@ def _draw_losses(axes: Any, outcome: Outcome) -> None:
     for spine in axes.spines.values():
         spine.set_color(SIGN)
         spine.set_linewidth(0.8)
-    up = f"0-1 loss of {outcome.observations():.0f} observations (mean)"
-    _label(axes, f"0-1 policy loss, {experiment.runs} runs", "iteration", up)
+    up = f"0-1 loss of {outcome.observations():.0f} observations"
+    _label(axes, f"0-1 policy loss, mean of {experiment.runs} runs", "iteration", up)
     axes.legend(
         fontsize=8, labelcolor=INK, frameon=True, framealpha=0.85, edgecolor="none", handlelength=3
     )

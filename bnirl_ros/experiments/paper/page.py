@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -91,11 +92,17 @@ def short(claims: Sequence[Claim]) -> str:
     """The claims for the terminal, a line or two each; no newline at the end."""
     lines = []
     for claim in claims:
-        lines.append(f"{claim.section:8s} {'yes' if claim.holds else 'NO ':3s} {claim.statement}")
-        lines.append(f"{'':12s} {claim.ours}; the paper: {claim.paper}")
+        head = f"{claim.section:8s} {'yes' if claim.holds else 'NO':4s}"
+        lines += _wrapped(head, claim.statement)
+        lines += _wrapped("", f"{claim.ours}; the paper: {claim.paper}")
         if not claim.holds:
-            lines.append(f"{'':12s} why: {claim.why}")
+            lines += _wrapped("", f"why: {claim.why}")
     return "\n".join([*lines, verdict(claims)])
+
+
+def _wrapped(head: str, text: str) -> list[str]:
+    """A text in lines of a terminal's width, indented, the first one after a head."""
+    return textwrap.wrap(text, 96, initial_indent=f"{head:13s} ", subsequent_indent=" " * 14)
 
 
 def page(report: Report) -> str:
@@ -162,14 +169,13 @@ def _claims(claims: Sequence[Claim]) -> str:
 def _section(section: str, outcome: Outcome) -> str:
     experiment = outcome.experiment
     name = FIGURES[section]
-    low, high = BAND
     lines = [
         f"## Section {section}",
         "",
         f"![{name.replace('_', ' ')}]({name}.png)",
         "",
         f"Observations of run 1, a dot for staying, and the 0-1 policy loss: the mean of "
-        f"{experiment.runs} runs, with a band from their {low}th to their {high}th percentile."
+        f"{experiment.runs} runs, with a band of {BAND:g} standard errors to either side."
         + (
             " Below, the subgoals of run 1, boxed, and the observations assigned to each: in the "
             "best sample, and in the posterior mode. A cross marks a true subgoal that is "
