@@ -10,6 +10,8 @@ WITH ?=
 PYTEST_ARGS ?=
 # Further arguments for the study, such as STUDY_ARGS='--only turtle --jobs 1'.
 STUDY_ARGS ?=
+# Further arguments for the paper's experiments, such as REPRODUCE_ARGS='4.1 --runs 5'.
+REPRODUCE_ARGS ?=
 # The folder with the recordings of human play, for `make bags` and `make study`.
 OVERCOOKED ?= ../shared/data/overcooked
 # The recording of a turtlesim robot, for `make bags`.
@@ -27,7 +29,7 @@ endif
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 unexport AMENT_PREFIX_PATH PYTHONPATH PYTHONHOME RMW_IMPLEMENTATION
 
-.PHONY: help demo test lint unit bags benchmark study venv clean
+.PHONY: help demo test lint unit bags benchmark study reproduce venv clean
 
 help:  ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -54,6 +56,9 @@ benchmark: venv  ## Time the main job and its parts
 
 study: venv  ## Measure what the models find, into bnirl_out/study.md
 	$(BIN)/python -m bnirl_ros.experiments.study --overcooked "$(OVERCOOKED)" $(STUDY_ARGS)
+
+reproduce: venv  ## Run the paper's experiments, into bnirl_out/reproduction.md
+	$(BIN)/bnirl reproduce $(REPRODUCE_ARGS)
 
 venv:  ## Make the virtual environment, or bring it up to date
 	@scripts/venv $(VENV)

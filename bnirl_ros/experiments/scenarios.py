@@ -40,7 +40,7 @@ that every site attracts, the reward falling with the distance from it."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Setting:
+class GridScenario:
     """A world, and where and how often demonstrations begin in it.
 
     Attributes:
@@ -85,7 +85,7 @@ class Setting:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scenario(Setting):
+class Scenario(GridScenario):
     """A demonstrator that goes from subgoal to subgoal (sections 4.1 and 4.3).
 
     Attributes:
@@ -96,7 +96,7 @@ class Scenario(Setting):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RewardScenario(Setting):
+class RewardScenario(GridScenario):
     """A demonstrator that follows one reward, linear in features (section 4.2).
 
     Attributes:

@@ -133,12 +133,12 @@ def _settings(report: Report) -> str:
     parameters = report.parameters
     experiment = next((outcome.experiment for outcome in report.outcomes.values()), None)
     much = (
-        f"{experiment.runs} runs of {experiment.iterations} iterations each, "
+        f"There are {experiment.runs} runs of {experiment.iterations} iterations each, with "
         if experiment
-        else ""
+        else "The paper's method has "
     )
     return (
-        f"{much}alpha {parameters.alpha:g}, eta {parameters.eta:g}, c 1. An iteration of the "
+        f"{much}alpha {parameters.alpha:g}, eta {parameters.eta:g} and c 1. An iteration of the "
         "paper's method is a sweep of its Gibbs sampler, and its loss at an iteration is that of "
         "the best sample so far, the paper's empirical mode: each observation is held against the "
         "greedy actions for its own subgoal in that sample. The posterior mode is what coordinate "
@@ -219,17 +219,17 @@ def _losses(section: str, outcome: Outcome) -> Table:
 
 
 def _table_1(table: Table1) -> Table:
+    ended = ", ".join(
+        f"{cost.algorithm} after {cost.new_answers:.0f}"
+        for cost in table.costs.values()
+        if cost.new_answers < table.iterations
+    )
     return Table(
         title="Table 1: run times",
         text=f"Medians over demonstrations of section 4.2, on one core of: {table.machine}. "
-        "The paper's were Matlab's, and its machine is not named. An iteration is one that finds "
-        "a new answer: "
-        + ", ".join(
-            f"{cost.algorithm} ends after {cost.new_answers:.0f}"
-            for cost in table.costs.values()
-            if cost.new_answers < table.iterations
-        )
-        + ". All algorithms solve their MDPs with the same kernels.",
+        "The paper's were Matlab's, and its machine is not named. All algorithms solve their MDPs "
+        "with the same kernels. An iteration is one that finds a new answer"
+        + (f"; there are no more of {ended}." if ended else "."),
         header=table1.header(table),
         rows=tuple(table1.rows(table)),
     )

@@ -112,7 +112,7 @@ def reproduce(plan: Plan, folder: Path, watch: Watch) -> Report:
             section: [(each, Outcome.of(each.experiment, courses)) for each in variations]
             for section, variations in varied.items()
         },
-        detours=by_detour(begun_elsewhere, exact),
+        detours=by_detour(begun_elsewhere, exact) if begun_elsewhere else (),
         table1=times,
         parameters=plan.parameters,
         machine=machine(),
