@@ -304,14 +304,11 @@ def test_feature_subgoals_live_are_those_of_the_command_and_show_all_their_cells
         entry["rank"]: entry
         for entry in json.loads((live / "subgoals.json").read_text())["subgoals"]
     }
-    node.peer.until(
-        lambda: (
-            {each.id for each in node.outputs["subgoals"][-1].markers if each.ns} == {*entries}
-        ),
-        "the subgoals of the inference",
-    )
-    sets = [each for each in node.outputs["subgoals"][-1].markers if each.ns == "cells"]
-    assert [each.id for each in sets] == list(entries)
+
+    def sets() -> list[Any]:
+        return [each for each in node.outputs["subgoals"][-1].markers if each.ns == "cells"]
+
+    node.peer.until(lambda: [each.id for each in sets()] == [*entries], "the subgoals inferred")
     for each in sets():
         assert each.type == each.CUBE_LIST
         shown = {(math.floor(point.x), math.floor(point.y)) for point in each.points}
