@@ -269,7 +269,7 @@ def test_only_the_sequential_model_filters() -> None:
 ROOMS = parse_text_grid("...#.\n...#.\n...#.\n", "two rooms")
 
 
-def filter_in_a_room() -> SubgoalFilter:
+def posterior_in_a_room() -> Posterior:
     """Of a demonstrator with four moves that was never in the room on the right."""
     learnt = Demonstration(
         np.zeros(4, dtype=np.int64),
@@ -278,7 +278,20 @@ def filter_in_a_room() -> SubgoalFilter:
         *WITHOUT_LAST_POSES,
     )
     settings = Settings(chains=1, sweeps=30, burn_in=10, moves=4)
-    return SubgoalFilter(infer(learnt, ROOMS, settings), ROOMS)
+    return infer(learnt, ROOMS, settings)
+
+
+def filter_in_a_room() -> SubgoalFilter:
+    return SubgoalFilter(posterior_in_a_room(), ROOMS)
+
+
+def test_what_lies_where_no_candidate_can_be_reached_is_not_foreseen() -> None:
+    posterior = posterior_in_a_room()
+    elsewhere = Demonstration(
+        np.zeros(1, dtype=np.int64), np.array([(4, 1)]), np.array([1]), *WITHOUT_LAST_POSES
+    )
+    with pytest.raises(InputError, match="an observation lies where no candidate can be reached"):
+        log_predictive(posterior, elsewhere, ROOMS)
 
 
 def test_a_cell_that_cannot_be_watched_is_refused_and_changes_nothing() -> None:

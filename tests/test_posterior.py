@@ -249,6 +249,15 @@ def test_the_samplers_take_any_finite_mdp() -> None:
     np.testing.assert_array_equal(draws.subgoal_of, on_map.subgoal_of)
 
 
+def test_an_action_that_there_is_not_is_refused() -> None:
+    world = grid_world(MAP, replace(QUICK, moves=4))
+    words = "action 2: is none of 0, 1, 3, 5, 7"
+    with pytest.raises(InputError, match=words):
+        pursuit_model(world, [0, 1], [1, 2], [True, False], [0, 1])
+    with pytest.raises(InputError, match=words):
+        subgoal_mixture(world, [0, 1], [1, 2], [0, 1], alpha=50.0, eta=1.0)
+
+
 @pytest.mark.parametrize("model", MODELS)
 def test_progress_counts_every_sweep_and_stopping_stops(model: str) -> None:
     settings = replace(QUICK, model=model)

@@ -126,7 +126,8 @@ def evenly_spaced_draws(
         (D, G) weights as in `weights_of_draws`, and (D, P) parameters in the order of `PRIORS`.
 
     Raises:
-        InputError: the posterior is not one of the sequential model.
+        InputError: the posterior is not one of the sequential model, or no candidate can be
+            reached from an observation.
     """
     if posterior.settings.model != "sequential":
         raise InputError("only the sequential model can be filtered; infer with it")

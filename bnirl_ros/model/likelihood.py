@@ -9,11 +9,28 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from bnirl_ros.errors import InputError
+from bnirl_ros.mdp.process import MarkovDecisionProcess
+
 LIKELIHOODS = ("delay", "value")
 """What an action costs: steps until the subgoal (`delays`), or value (`value_losses`, (7))."""
 
 _LOWEST_VALUE = 1e-11  # of Q*: below it, differences between actions are rounding
 _NEVER = 1e9  # steps; an action from which the goal cannot be reached any more
+
+
+def action_columns(mdp: MarkovDecisionProcess, actions: npt.ArrayLike) -> npt.NDArray[np.int64]:
+    """(N,) column of each action (N,) among those of a process.
+
+    Raises:
+        InputError: there is no such action.
+    """
+    chosen = np.asarray(actions)
+    there = np.isin(chosen, mdp.actions)
+    if not there.all():
+        known = ", ".join(map(str, mdp.actions))
+        raise InputError(f"action {chosen[~there][0]}: is none of {known}")
+    return np.searchsorted(mdp.actions, chosen)
 
 
 def action_log_likelihood(

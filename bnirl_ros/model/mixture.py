@@ -11,7 +11,7 @@ import numpy.typing as npt
 from bnirl_ros.mdp.goal_values import goal_values
 from bnirl_ros.mdp.goals import Goals
 from bnirl_ros.mdp.process import MarkovDecisionProcess
-from bnirl_ros.model.likelihood import action_log_likelihood
+from bnirl_ros.model.likelihood import action_columns, action_log_likelihood
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,10 +89,13 @@ def subgoal_mixture(
         candidates: the goals in the support of P(g), or (G,) state numbers of single ones.
         alpha: confidence; above 0.
         eta: concentration; above 0.
+
+    Raises:
+        InputError: there is no such action.
     """
     goals = candidates if isinstance(candidates, Goals) else Goals.of_states(candidates)
     visited, state_index = np.unique(np.asarray(states), return_inverse=True)
-    position = np.searchsorted(mdp.actions, np.asarray(actions))
+    position = action_columns(mdp, actions)
     pairs, pair_of = np.unique(state_index * len(mdp.actions) + position, return_inverse=True)
     values = goal_values(mdp, goals, visited)
     by_pair = action_log_likelihood(values, alpha).reshape(-1, len(goals))

@@ -19,10 +19,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from bnirl_ros.errors import InputError
 from bnirl_ros.mdp.goal_values import goal_values
 from bnirl_ros.mdp.goals import Goals
 from bnirl_ros.mdp.process import MarkovDecisionProcess
-from bnirl_ros.model.likelihood import delays, value_losses
+from bnirl_ros.model.likelihood import action_columns, delays, value_losses
 
 _VALUE_TOLERANCE = 1e-13  # delays are ratios of values, which fall off with the distance
 
@@ -222,12 +223,13 @@ def pursuit_model(
         fixed: values of parameters in `PRIORS` that are not to be inferred.
 
     Raises:
-        ValueError: an observation lies where no candidate can be reached, or a candidate in more
-            than one part of the map.
+        InputError: an observation lies where no candidate can be reached, or there is no such
+            action.
+        ValueError: a candidate lies in more than one part of the map.
     """
     goals = candidates if isinstance(candidates, Goals) else Goals.of_states(candidates)
     visited, state_of = np.unique(np.asarray(states, dtype=np.int64), return_inverse=True)
-    action_of = np.searchsorted(mdp.actions, np.asarray(actions))
+    action_of = action_columns(mdp, actions)
     parts = np.unique(
         np.concatenate([mdp.parts_of(visited), mdp.parts_of(goals.states)]), return_inverse=True
     )[1]
@@ -236,7 +238,7 @@ def pursuit_model(
     if (goal_part != candidate_part[goals.goal_of]).any():
         raise ValueError("a candidate lies in more than one part of the map")
     if not np.isin(state_part, candidate_part).all():
-        raise ValueError("an observation lies where no candidate can be reached")
+        raise InputError("an observation lies where no candidate can be reached")
     values = goal_values(mdp, goals, visited, _VALUE_TOLERANCE)
     priors = dict(PRIORS)
     if likelihood == "delay":
