@@ -10,11 +10,17 @@ from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.errors import InputError
 from bnirl_ros.inference.posterior import Posterior, grid_world, pursuit_model_of
-from bnirl_ros.inference.pursuit_gibbs import forward_pass, kernel_model, softmax_table
+from bnirl_ros.inference.pursuit_gibbs import (
+    forward_pass,
+    kernel_model,
+    softmax_table,
+    switch_probability,
+)
 from bnirl_ros.inference.runs import run_counts
 from bnirl_ros.maps.grid_map import GridMap
 from bnirl_ros.model.pursuits import ALPHA, ETA, PRIORS, PursuitModel
@@ -68,13 +74,30 @@ def foreseen(
     Args:
         model, weights, parameters: as in `filtered`.
     """
-    before = np.roll(filtered(model, weights, parameters)[0], 1, axis=0)
-    here = model.candidate_part == model.state_part[model.state_of][:, None]
-    drawn = np.where(here, weights, 0.0)
-    rho = model.switch_probabilities(parameters)
-    switched = (rho * before).sum(axis=1, keepdims=True)
-    # At a start nothing is kept, and what was before belongs to another episode.
-    return np.where(model.starts[:, None], drawn, (1.0 - rho) * before + switched * drawn)
+    result = filtered(model, weights, parameters)[0]
+    _one_step_back(kernel_model(model), parameters, weights, result)
+    return result
+
+
+@njit(nogil=True, cache=True)
+def _one_step_back(model, parameters, weights, belief):  # type: ignore[no-untyped-def]
+    """Turn P(subgoal at t | actions up to t) into that given the actions before t, in place."""
+    candidates = weights.shape[0]
+    for t in range(belief.shape[0] - 1, -1, -1):  # the one before t is still as it was
+        part = model.state_part[model.state_of[t]]
+        switched = 0.0
+        for candidate in range(candidates):
+            if model.starts[t]:
+                switched = 1.0
+                belief[t, candidate] = 0.0
+            else:
+                rho = switch_probability(model, parameters, t, candidate)
+                before = belief[t - 1, candidate]
+                switched += rho * before
+                belief[t, candidate] = (1.0 - rho) * before
+        for candidate in range(candidates):
+            if model.candidate_part[candidate] == part:
+                belief[t, candidate] += switched * weights[candidate]
 
 
 def weights_of_draws(

@@ -140,16 +140,12 @@ class PursuitModel:
             subgoal_of: (N,) candidate index theta of each observation's subgoal.
             parameters: in the order of `PRIORS`.
         """
+        on_arrival, at_subgoal, elsewhere = parameters[[ON_ARRIVAL, AT_SUBGOAL, ELSEWHERE]]
         before = np.roll(subgoal_of, 1)
         here = self.arrived[self.state_of, before]
         there_already = self.arrived[np.roll(self.state_of, 1), before]
-        return np.where(self.starts, 1.0, _rho(here, there_already, parameters))
-
-    def switch_probabilities(self, parameters: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """(N, G) the same for every subgoal that may have been pursued before."""
-        here = self.arrived[self.state_of]
-        there_already = self.arrived[np.roll(self.state_of, 1)]
-        return np.where(self.starts[:, None], 1.0, _rho(here, there_already, parameters))
+        rho = np.where(here, np.where(there_already, at_subgoal, on_arrival), elsewhere)
+        return np.where(self.starts, 1.0, rho)
 
     def log_joint(
         self,
@@ -176,16 +172,6 @@ class PursuitModel:
             here = self.candidate_part == part
             total += _log_urn(counts[here], eta * self.prior[here])
         return float(total)
-
-
-def _rho(
-    here: npt.NDArray[np.bool_],
-    there_already: npt.NDArray[np.bool_],
-    parameters: npt.NDArray[np.float64],
-) -> npt.NDArray[np.float64]:
-    """Probability of a switch, by whether the demonstrator is at its subgoal, and already was."""
-    on_arrival, at_subgoal, elsewhere = parameters[[ON_ARRIVAL, AT_SUBGOAL, ELSEWHERE]]
-    return np.where(here, np.where(there_already, at_subgoal, on_arrival), elsewhere)
 
 
 def _log_urn(counts: npt.NDArray[np.int64], weights: npt.NDArray[np.float64]) -> float:
