@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from bnirl_ros.baselines import RIVALS, Observed, PolicyWalk, Rival
+from bnirl_ros.baselines import Observed, Rival, initialised
 from bnirl_ros.experiments.paper.trials import (
     Trial,
     candidate_subgoals,
@@ -200,9 +200,9 @@ def _subgoals(
 
 def rival_of(trial: Trial, name: str, generator: np.random.Generator) -> Rival:
     """One of the `RIVAL_NAMES`, initialised on a trial."""
-    given = (trial.process, Observed.of(trial.demonstration, trial.world), trial.feature_matrix)
-    rival = RIVALS[RIVAL_NAMES[name]]
-    return rival(*given, generator) if issubclass(rival, PolicyWalk) else rival(*given)
+    observed = Observed.of(trial.demonstration, trial.world)
+    features = trial.feature_matrix
+    return initialised(RIVAL_NAMES[name], trial.process, observed, features, generator)
 
 
 def rival_course(
