@@ -17,6 +17,7 @@ import pytest
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.errors import InputError
 from bnirl_ros.experiments.overcooked import LAYOUTS
+from bnirl_ros.experiments.paper.courses import RIVAL_NAMES
 from bnirl_ros.experiments.study import (
     cost,
     kitchens,
@@ -283,10 +284,12 @@ def test_a_trials_actions_are_drawn_together() -> None:
 TO_THE_RIGHT = ((0, "E"), (1, "stay"), (1, "stay"))
 
 
-@pytest.mark.parametrize("learner", [*MODELS, next_action.NO_MODEL])
+@pytest.mark.parametrize("learner", [*MODELS, *RIVAL_NAMES, next_action.NO_MODEL])
 def test_every_learner_is_measured_on_what_it_has_not_seen(
     learner: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    if RIVAL_NAMES.get(learner) == "abbeel_ng":
+        pytest.importorskip("clarabel")
     quick = dict(sweeps=30, burn_in=10, chains=1)
     monkeypatch.setattr(
         next_action, "settings_of", lambda model, **other: Settings(model=model, **quick, **other)
@@ -301,15 +304,27 @@ def test_every_learner_is_measured_on_what_it_has_not_seen(
         log = losses(probability, held_out, world).log
         if learner != next_action.NO_MODEL:
             assert log[0] < log[1]
-    expected = (
-        list(WITHOUT_MODEL)
-        if learner == next_action.NO_MODEL
-        else [
-            f"{learner}, predictive",
-            f"{learner}, (19)",
-        ]
-    )
-    assert list(told) == expected
+    expected = {
+        next_action.NO_MODEL: list(WITHOUT_MODEL),
+        **{model: [f"{model}, predictive", f"{model}, (19)"] for model in MODELS},
+    }
+    assert list(told) == expected.get(learner, [learner])
+
+
+def test_a_rivals_confidence_is_the_one_that_suits_what_it_learnt_from() -> None:
+    # Q* tells in the left cell only, where it is 2 better to go; seen is E three times of four.
+    learnt = in_corridor(*[(0, 0, name) for name in ("E", "E", "stay", "E")], (0, 1, "stay"))
+    held_out = in_corridor((2, 0, "E"), (2, 1, "W"))
+    world = grid_world(CORRIDOR, Settings(moves=4))
+    values = np.zeros((3, 5))
+    values[0, 1] = 2.0
+    told = next_action.predict_by_values(values, learnt, held_out, world)
+    # Going and staying are what can be done, each one action however it is done.
+    expected = [[0.25 / 4, 0.75, *[0.25 / 4] * 3], [0.5 / 4] * 3 + [0.5, 0.5 / 4]]
+    np.testing.assert_allclose(told, expected, atol=1e-3)
+    # Where no action is better than another, none is more probable.
+    alike = next_action.predict_by_values(np.zeros((3, 5)), learnt, held_out, world)
+    np.testing.assert_allclose(alike[0], [0.5 / 4, 0.5, *[0.5 / 4] * 3])
 
 
 def test_the_table_has_both_losses_of_every_prediction() -> None:

@@ -47,7 +47,7 @@ def losses(
         demonstration: N observations, what was really done.
         world: where they were made.
     """
-    same, taken = _what_was_done(demonstration, world)
+    same, taken = what_was_done(demonstration, world)
     rows = np.arange(len(taken))
     outcomes = by_outcome(probability, same)
     best = outcomes >= outcomes.max(axis=1, keepdims=True) * (1.0 - _TIE)
@@ -77,7 +77,7 @@ def frequency(
 ) -> npt.NDArray[np.float64]:
     """(N, A) how often each was done in that state, `SMOOTHING` added to every count."""
     counts = np.full((world.state_count, len(world.actions)), SMOOTHING)
-    _, taken = _what_was_done(learnt, world)
+    _, taken = what_was_done(learnt, world)
     np.add.at(counts, (world.states_of(learnt.cells), taken), 1.0)
     return _by_counts(counts, held_out, world)
 
@@ -92,7 +92,7 @@ WITHOUT_MODEL: dict[
 """Predictions to hold a model against, from what was learnt to (N, A) of what was held out."""
 
 
-def _what_was_done(
+def what_was_done(
     demonstration: Demonstration, world: GridWorld
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """(N, A) column of the first action that does the same as each, and (N,) that of the taken."""
