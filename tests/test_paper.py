@@ -368,6 +368,19 @@ def test_convergence_is_to_what_the_demonstrator_does() -> None:
     assert all(claim.why for claim in claims if not claim.holds)
 
 
+def test_a_constant_reward_is_told() -> None:
+    found = outcome("4.3", dict.fromkeys(RIVAL_NAMES, 50.0))
+    courses = dict(found.courses)
+    courses["Bayesian IRL"] = [
+        *(replace(course(0.0), constant=True) for _ in range(3)),
+        *courses["Bayesian IRL"][3:],
+    ]
+    claims = claims_of("4.3", replace(found, courses=courses))
+    told = [claim.ours for claim in claims if "constant" in claim.ours]
+    assert len(told) == 1
+    assert "in 3 of the runs" in told[0]
+
+
 def times(sweep: float, rival: float, ended: float = 100.0) -> Table1:
     costs = {name: Cost(name, 0.01, sweep, 100 * sweep, 100.0) for name in BNIRL}
     costs |= {name: Cost(name, 0.02, rival, ended * rival, ended) for name in RIVAL_NAMES}

@@ -192,9 +192,16 @@ def _loss_in_words(name: str, outcome: Outcome) -> str:
     final = outcome.final_losses(name)
     low, high = final.min(), final.max()
     share = final.mean() / outcome.observations()
+    constant = sum(course.constant for course in outcome.courses[name])
     return (
         f"{final.mean():.1f} of {outcome.observations():.0f} ({share:.0%}; "
         f"{low:.0f} to {high:.0f} in the runs)"
+        + (
+            f"; in {constant} of the runs the reward ends as a constant, to which every action is "
+            "as good"
+            if constant
+            else ""
+        )
     )
 
 

@@ -15,6 +15,7 @@ from bnirl_ros.experiments.paper.trials import (
     candidate_subgoals,
     goal_values_of,
     reward_losses,
+    reward_range,
     true_subgoals,
     unmatched,
 )
@@ -89,11 +90,14 @@ class Course:
             being where it starts; NaN where it has no answer yet. For the Gibbs sampler that is
             the best sample so far.
         found: the subgoals, for the paper's method.
+        constant: whether the last answer is a reward that is the same everywhere. To it every
+            action is as good, so that its loss is 0 though it says nothing.
     """
 
     observations: int
     loss: npt.NDArray[np.float64]
     found: Found | None = None
+    constant: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +221,8 @@ def rival_course(
             known = estimate
             lost = reward_losses(trial, estimate.reward, estimate.action_values)
         losses.append(float(lost.sum()))
-    return Course(len(trial.demonstration), np.array(losses, dtype=np.float64))
+    constant = reward_range(trial, estimate.reward) == 0.0
+    return Course(len(trial.demonstration), np.array(losses), constant=constant)
 
 
 ALGORITHMS = (*BNIRL, *RIVAL_NAMES)

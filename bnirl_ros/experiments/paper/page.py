@@ -347,7 +347,11 @@ def numbers(report: Report) -> dict[str, Any]:
 def _course(course: Course) -> dict[str, Any]:
     """A course as JSON holds it: what is not known is null."""
     loss = [None if math.isnan(value) else int(value) for value in course.loss.tolist()]
-    document: dict[str, Any] = {"observations": course.observations, "loss": loss}
+    document: dict[str, Any] = {
+        "observations": course.observations,
+        "loss": loss,
+        "constant": course.constant,
+    }
     if course.found is not None:
         found = asdict(course.found)
         found["sample_loss"] = course.found.sample_loss.tolist()

@@ -127,6 +127,11 @@ def goal_values_of(trial: Trial, goals: Goals) -> npt.NDArray[np.float64]:
     return goal_values(trial.process, goals, visited, VALUE_TOLERANCE)[index]
 
 
+def reward_range(trial: Trial, reward: npt.NDArray[np.float64]) -> float:
+    """Largest less smallest reward (S,) of the free cells."""
+    return float(np.ptp(reward[trial.world.free.reshape(-1)]))
+
+
 def reward_losses(
     trial: Trial, reward: npt.NDArray[np.float64], nearly: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.bool_]:
@@ -140,8 +145,7 @@ def reward_losses(
         reward: (S,) R(s).
         nearly: (S, A) action values under it, to a tolerance that may be larger than `TIE`.
     """
-    reached = reward[trial.world.free.reshape(-1)]
-    scale = float(np.ptp(reached)) or 1.0  # a constant reward is for any action
+    scale = reward_range(trial, reward) or 1.0  # to a constant one every action is as good
     rewards, start = reward[:, None] / scale, nearly.max(axis=1, keepdims=True) / scale
     values = optimal_values(trial.process, rewards, VALUE_TOLERANCE, start)
     visited, index = np.unique(trial.states, return_inverse=True)
