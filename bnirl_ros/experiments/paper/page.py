@@ -7,17 +7,17 @@ import json
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bnirl_ros.experiments.identifiability import DetourBin
+from bnirl_ros.experiments.identifiability import DetourBin, detours
 from bnirl_ros.experiments.paper import sensitivity, table1
 from bnirl_ros.experiments.paper.claims import Claim, verdict
 from bnirl_ros.experiments.paper.courses import Course, Parameters
-from bnirl_ros.experiments.paper.experiments import LAST, Outcome, variants
+from bnirl_ros.experiments.paper.experiments import LAST, Outcome, rivals, variants
 from bnirl_ros.experiments.paper.figures import BAND, FIGURES
 from bnirl_ros.experiments.paper.sensitivity import Variation
 from bnirl_ros.experiments.paper.table1 import Table1
@@ -25,7 +25,9 @@ from bnirl_ros.experiments.scenarios import (
     PAPER_FEATURES,
     PAPER_GRID,
     PAPER_LOOP,
+    SPLITS,
     TIE,
+    Cell,
     Scenario,
     number_of,
 )
@@ -124,8 +126,17 @@ def page(report: Report) -> str:
         parts.append(_choices(report).markdown())
     for section, measured in report.variations.items():
         parts.append(sensitivity.table_of(section, measured).markdown())
+    if len(report.outcomes) > 1:
+        parts.append(_alphas(report).markdown())
     if report.detours:
         parts.append(_detours(report.detours).markdown())
+    scenarios = [
+        outcome.experiment.scenario
+        for outcome in report.outcomes.values()
+        if isinstance(outcome.experiment.scenario, Scenario)
+    ]
+    if scenarios:
+        parts.append(_true_detours(scenarios).markdown())
     return "\n".join(parts)
 
 
@@ -236,9 +247,6 @@ def _table_1(table: Table1) -> Table:
 
 
 def _choices(report: Report) -> Table:
-    def place(cell: tuple[int, int]) -> str:
-        return "({}, {})".format(*number_of(cell))
-
     success = PAPER_GRID.success
     return Table(
         title="What the paper does not print, and what we took",
@@ -265,7 +273,7 @@ def _choices(report: Report) -> Table:
             ),
             (
                 "start of 4.1",
-                place(PAPER_GRID.start),
+                _place(PAPER_GRID.start),
                 "no subgoal is on the way to another one: see the last table",
             ),
             (
@@ -275,7 +283,7 @@ def _choices(report: Report) -> Table:
             ),
             (
                 "end of a demonstration of 4.1 and 4.3",
-                f"arrival at {place(PAPER_GRID.subgoals[-1])}, {place(PAPER_LOOP.subgoals[-1])}",
+                f"arrival at {_place(PAPER_GRID.subgoals[-1])}, {_place(PAPER_LOOP.subgoals[-1])}",
                 "no action is taken there",
             ),
             (
@@ -295,6 +303,80 @@ def _choices(report: Report) -> Table:
                 "the sum that is printed is not the conditional of the joint (10)",
             ),
         ),
+    )
+
+
+def _place(cell: Cell) -> str:
+    """A cell in the paper's numbers."""
+    return "({}, {})".format(*number_of(cell))
+
+
+def _alphas(report: Report) -> Table:
+    """The same as in the tables of other choices, alpha by alpha."""
+    cells: dict[str, dict[str, str]] = {}
+    for section, measured in report.variations.items():
+        for variation, outcome in measured:
+            if variation.choice != "alpha":
+                continue
+            row = cells.setdefault(variation.value, {})
+            for name in variants(outcome.experiment.algorithms):
+                row[f"{section} {name.removeprefix('BN-IRL ')}"] = _exact_or_loss(outcome, name)
+    columns = list(dict.fromkeys(column for row in cells.values() for column in row))
+    ours = f"{report.parameters.alpha:g}"
+    best = [
+        f"The best rival's loss in 4.2 is {_best_rival(outcome):.1f}."
+        for section, outcome in report.outcomes.items()
+        if section == "4.2"
+    ]
+    return Table(
+        title="One alpha for all",
+        text=" ".join(
+            [
+                "In how many runs the mode is exact, and in 4.2 the loss. A demonstrator that is "
+                "always optimal calls for a large alpha. But the larger it is, the more often the "
+                "same actions are as likely for a cell beside a subgoal: the joint (10) of both "
+                "is then the same, and which one the mode has is by chance.",
+                *best,
+            ]
+        ),
+        header=("alpha", *columns),
+        rows=tuple(
+            (f"**{value}**" if value == ours else value, *(row.get(each, "") for each in columns))
+            for value, row in cells.items()
+        ),
+    )
+
+
+def _exact_or_loss(outcome: Outcome, name: str) -> str:
+    if not isinstance(outcome.experiment.scenario, Scenario):
+        return f"{outcome.final_losses(name).mean():.1f}"
+    found = outcome.found(name)
+    return f"{sum(each.mode_exact for each in found)} of {len(found)}"
+
+
+def _best_rival(outcome: Outcome) -> float:
+    names = rivals(outcome.experiment.algorithms)
+    return min(float(outcome.final_losses(name).mean()) for name in names)
+
+
+def _true_detours(scenarios: Sequence[Scenario]) -> Table:
+    rows = []
+    for scenario in scenarios:
+        for split in SPLITS:
+            found = detours(replace(scenario, split=split))
+            told = [
+                f"{_place(cell)} {steps:.1f}"
+                for cell, steps in zip(scenario.subgoals, found, strict=True)
+            ]
+            value = f"**{split}**" if split == scenario.split else split
+            rows.append((scenario.section, value, ", ".join(told)))
+    return Table(
+        title="What noise does to the way",
+        text="How many steps longer the way to another subgoal is over each true subgoal than "
+        "straight, at least, by where noise leads. Diagonal steps make many ways equally short. "
+        "Where it is 0, the subgoal lies on one of them, and the mode can do without it.",
+        header=("section", "noise", "subgoals and their detours [steps]"),
+        rows=tuple(rows),
     )
 
 
