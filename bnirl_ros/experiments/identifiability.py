@@ -10,8 +10,10 @@ left 2 of the first 10 seeds.
 
 It depends as much on where demonstrations begin. Whoever comes by a subgoal on the shortest way to
 another one does nothing that the other one alone would not explain. `--starts` lets one
-demonstration begin in many cells of the map, and counts by how much of a `detour` the first
-subgoal is from there.
+demonstration begin in many cells of the map, and counts by how many steps of a detour the first
+subgoal is from there. With the paper's model and 100 sweeps, as `bnirl reproduce` runs it on
+`paper_grid`, the mode is exact in 7 % where that is less than half a step, and in 99 % where it is
+eight or more.
 """
 
 from __future__ import annotations

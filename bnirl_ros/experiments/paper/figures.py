@@ -14,11 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from bnirl_ros.demonstrations.demonstration import Demonstration
-from bnirl_ros.experiments.paper.courses import BNIRL, mixture_of, sample
+from bnirl_ros.experiments.paper.courses import BNIRL, empirical_mode, mixture_of, sample
 from bnirl_ros.experiments.paper.experiments import Experiment, Outcome, generator_of
 from bnirl_ros.experiments.paper.trials import Trial, candidate_subgoals, trial_of
 from bnirl_ros.experiments.scenarios import Cell, number_of
-from bnirl_ros.inference.mode import ascend
 from bnirl_ros.maps import GridMap
 from bnirl_ros.views.colours import INK, Colour, colour_of, writing_on
 from bnirl_ros.views.map_panel import SIGN, draw_free_space, draw_observations, import_matplotlib
@@ -68,8 +67,7 @@ def assignments(experiment: Experiment, run: int) -> list[Assignment]:
     mixture = mixture_of(trial, candidates, experiment.parameters)
     generator = generator_of(run, "BN-IRL State")
     samples = sample(mixture, experiment.iterations, generator)
-    best = int(samples.log_joint.argmax())
-    mode = ascend(mixture, samples.partition_of[best], samples.subgoal_of[best])
+    best, mode = empirical_mode(mixture, samples)
     return [
         _assignment(title, candidates.coordinates, subgoal_of, trial.truth)
         for title, subgoal_of in (
