@@ -67,10 +67,11 @@ def _values(kind: tuple[Nodetype, object]) -> st.SearchStrategy[object]:
         return messages(detail)
     if node == Nodetype.BASE:
         return _VALUES[detail[0]]
-    (inner, inner_detail), _ = detail
+    (inner, inner_detail), length = detail
     if inner == Nodetype.NAME:
         return st.lists(messages(inner_detail), max_size=3)
-    numbers = st.lists(_VALUES[inner_detail[0]], max_size=20)
+    fixed = length if node == Nodetype.ARRAY else 0
+    numbers = st.lists(_VALUES[inner_detail[0]], min_size=fixed, max_size=fixed or 20)
     return numbers.map(lambda values: np.array(values, dtype=inner_detail[0]))
 
 

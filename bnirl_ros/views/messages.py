@@ -22,6 +22,10 @@ def _no_cells() -> npt.NDArray[np.int8]:
     return np.zeros(0, dtype=np.int8)
 
 
+def _no_covariance() -> npt.NDArray[np.float64]:
+    return np.zeros(36)
+
+
 class Message:
     """A message: equal to another one of its type where all fields are, arrays by their values."""
 
@@ -144,6 +148,80 @@ class PoseStamped(Message):
     TYPE: ClassVar[str] = "geometry_msgs/msg/PoseStamped"
     header: Header = field(default_factory=Header)
     pose: Pose = field(default_factory=Pose)
+
+
+@dataclass(eq=False)
+class PoseWithCovariance(Message):
+    """geometry_msgs/msg/PoseWithCovariance; `covariance` (36,) is a 6 x 6 matrix by rows."""
+
+    TYPE: ClassVar[str] = "geometry_msgs/msg/PoseWithCovariance"
+    pose: Pose = field(default_factory=Pose)
+    covariance: npt.NDArray[np.float64] = field(default_factory=_no_covariance)
+
+
+@dataclass(eq=False)
+class PoseWithCovarianceStamped(Message):
+    """geometry_msgs/msg/PoseWithCovarianceStamped."""
+
+    TYPE: ClassVar[str] = "geometry_msgs/msg/PoseWithCovarianceStamped"
+    header: Header = field(default_factory=Header)
+    pose: PoseWithCovariance = field(default_factory=PoseWithCovariance)
+
+
+@dataclass(eq=False)
+class TwistStamped(Message):
+    """geometry_msgs/msg/TwistStamped."""
+
+    TYPE: ClassVar[str] = "geometry_msgs/msg/TwistStamped"
+    header: Header = field(default_factory=Header)
+    twist: Twist = field(default_factory=Twist)
+
+
+@dataclass(eq=False)
+class TwistWithCovariance(Message):
+    """geometry_msgs/msg/TwistWithCovariance; `covariance` (36,) is a 6 x 6 matrix by rows."""
+
+    TYPE: ClassVar[str] = "geometry_msgs/msg/TwistWithCovariance"
+    twist: Twist = field(default_factory=Twist)
+    covariance: npt.NDArray[np.float64] = field(default_factory=_no_covariance)
+
+
+@dataclass(eq=False)
+class Odometry(Message):
+    """nav_msgs/msg/Odometry: the pose of a child frame in the header's frame, and its velocity."""
+
+    TYPE: ClassVar[str] = "nav_msgs/msg/Odometry"
+    header: Header = field(default_factory=Header)
+    child_frame_id: str = ""
+    pose: PoseWithCovariance = field(default_factory=PoseWithCovariance)
+    twist: TwistWithCovariance = field(default_factory=TwistWithCovariance)
+
+
+@dataclass(eq=False)
+class Transform(Message):
+    """geometry_msgs/msg/Transform: a shift [m] and a rotation."""
+
+    TYPE: ClassVar[str] = "geometry_msgs/msg/Transform"
+    translation: Vector3 = field(default_factory=Vector3)
+    rotation: Quaternion = field(default_factory=Quaternion)
+
+
+@dataclass(eq=False)
+class TransformStamped(Message):
+    """geometry_msgs/msg/TransformStamped: where a child frame is in the header's frame."""
+
+    TYPE: ClassVar[str] = "geometry_msgs/msg/TransformStamped"
+    header: Header = field(default_factory=Header)
+    child_frame_id: str = ""
+    transform: Transform = field(default_factory=Transform)
+
+
+@dataclass(eq=False)
+class TFMessage(Message):
+    """tf2_msgs/msg/TFMessage."""
+
+    TYPE: ClassVar[str] = "tf2_msgs/msg/TFMessage"
+    transforms: list[TransformStamped] = field(default_factory=list)
 
 
 @dataclass(eq=False)
