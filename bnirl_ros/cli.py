@@ -113,7 +113,7 @@ def _parser() -> argparse.ArgumentParser:
 def _add_inference(parser: argparse.ArgumentParser) -> None:
     """What is inferred from, and every option of an inference."""
     from bnirl_ros.demonstrations.placement import EPISODE_GAP
-    from bnirl_ros.inference.settings import above_zero
+    from bnirl_ros.limits import above_zero
 
     parser.add_argument(
         "demonstration", metavar="DEMO", type=Path, help="rosbag2 folder, .mcap file or .csv"
@@ -149,7 +149,8 @@ def _add_inference(parser: argparse.ArgumentParser) -> None:
 
 def _add_reproduce(parser: argparse.ArgumentParser) -> None:
     """The options of `bnirl reproduce`."""
-    from bnirl_ros.inference.settings import PAPER_PARAMETERS, above_zero, one_or_more
+    from bnirl_ros.inference.settings import PAPER_PARAMETERS
+    from bnirl_ros.limits import above_zero, one_or_more
 
     parser.description = (
         "Run the experiments of section 4 of Michini and How (2012) and the times of its Table 1, "
@@ -200,7 +201,8 @@ def _cell(text: str) -> tuple[int, int]:
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
     """An option for every setting, with its range and default."""
-    from bnirl_ros.inference.settings import Settings, kind_of, limits_of
+    from bnirl_ros.inference.settings import Settings
+    from bnirl_ros.limits import kind_of, limits_of
 
     for setting in fields(Settings):
         limits = limits_of(setting)

@@ -27,7 +27,8 @@ import numpy as np
 
 from bnirl_ros.experiments.scenarios import SCENARIOS, Cell, Scenario, demonstrate
 from bnirl_ros.inference.posterior import infer
-from bnirl_ros.inference.settings import Settings, one_or_more
+from bnirl_ros.inference.settings import Settings
+from bnirl_ros.limits import one_or_more
 from bnirl_ros.mdp.goal_values import goal_values
 
 EDGES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)

@@ -21,7 +21,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from bnirl_ros.errors import InputError
-from bnirl_ros.inference.settings import Limits, Settings, limits_of
+from bnirl_ros.inference.settings import Settings
+from bnirl_ros.limits import Limits, limits_of
 
 INFERRED = -1.0
 """Value of a parameter of the model that is not given: ROS has none for nothing."""

@@ -19,7 +19,7 @@ from rclpy.utilities import remove_ros_args
 from bnirl_ros.bags.qos import LATCHED, QosProfile
 from bnirl_ros.bags.reader import Bag, RawMessage, Topic
 from bnirl_ros.errors import InputError
-from bnirl_ros.inference.settings import above_zero, one_or_more
+from bnirl_ros.limits import above_zero, one_or_more
 from bnirl_ros.maps import load_map
 from bnirl_ros.nodes.conversion import message_class, to_ros
 from bnirl_ros.nodes.process import run

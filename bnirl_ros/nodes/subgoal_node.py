@@ -23,8 +23,8 @@ from bnirl_ros.demonstrations.placement import EPISODE_GAP, place
 from bnirl_ros.demonstrations.recording import Recorder
 from bnirl_ros.errors import InputError
 from bnirl_ros.inference.background import BackgroundInference, Result
-from bnirl_ros.inference.settings import Limits
 from bnirl_ros.inference.summary import Summary, nothing_found
+from bnirl_ros.limits import Limits
 from bnirl_ros.maps import FeatureLayer, GridMap, load_features, with_features
 from bnirl_ros.nodes.conversion import message_class, to_ros
 from bnirl_ros.nodes.parameters import NodeParameter, declare, declare_settings

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from bnirl_ros.experiments.study.report import Table
-from bnirl_ros.inference.settings import Settings, limits_of
+from bnirl_ros.inference.settings import Settings
+from bnirl_ros.limits import limits_of
 
 SEED = 20120924
 """From which all random numbers of the study come: the first day of the paper's conference."""
