@@ -44,13 +44,16 @@ class GridMap:
 
     def cells_of(self, positions: npt.ArrayLike) -> npt.NDArray[np.int64]:
         """Cells (N, 2) in which the positions (N, 2) [m] lie; they may lie outside the map."""
+        # Far positions would overflow int64 (undefined in C); a cell this far is outside any map.
+        cells = np.clip(np.floor(self.coordinates_of(positions)), -(2**62), 2**62)
+        return np.asarray(cells, dtype=np.int64)
+
+    def coordinates_of(self, positions: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """The positions (N, 2) [m] along the map's axes, in cells from its lower left corner."""
         x, y, yaw = self.origin
         offset = np.asarray(positions, dtype=np.float64).reshape(-1, 2) - (x, y)
         cosine, sine = np.cos(yaw), np.sin(yaw)
-        along = offset @ np.array([[cosine, -sine], [sine, cosine]])
-        # Far positions would overflow int64 (undefined in C); a cell this far is outside any map.
-        cells = np.clip(np.floor(along / self.resolution), -(2**62), 2**62)
-        return np.asarray(cells, dtype=np.int64)
+        return np.asarray(offset @ np.array([[cosine, -sine], [sine, cosine]]) / self.resolution)
 
     def centres_of(self, cells: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Centres (N, 2) of the cells (N, 2) in the frame [m]."""
