@@ -12,16 +12,16 @@ from bag_support import SHARED_BAGS, needs_shared_bags
 from bnirl_ros.bags.demonstration import read_demonstration
 from bnirl_ros.bags.qos import RELIABLE
 from bnirl_ros.bags.writer import BagWriter
+from bnirl_ros.demonstrations.motion import fill_jumps
 from bnirl_ros.demonstrations.placement import place
+from bnirl_ros.demonstrations.velocity import TICK
 from bnirl_ros.errors import InputError
 from bnirl_ros.experiments.turtle import (
     SIDE,
-    TICK,
     TOPIC,
     TYPE,
     WAYPOINTS,
     drive,
-    fill_jumps,
     read_commands,
     read_turtle,
 )

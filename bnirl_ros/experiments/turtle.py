@@ -7,7 +7,6 @@ gathered since the start, for when the simulator's ticks fell is not in the reco
 
 from __future__ import annotations
 
-from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,8 @@ import numpy.typing as npt
 from bnirl_ros.bags.cdr import decode
 from bnirl_ros.bags.reader import Bag
 from bnirl_ros.demonstrations.demonstration import Demonstration
+from bnirl_ros.demonstrations.motion import fill_jumps
+from bnirl_ros.demonstrations.velocity import follow
 from bnirl_ros.errors import InputError
 from bnirl_ros.maps import GridMap
 from bnirl_ros.mdp.actions import STEPS
@@ -35,9 +36,6 @@ SIDE = 11.09
 
 HOLD = 1.0
 """How long turtlesim follows a command when no other comes [s]."""
-
-TICK = 0.016
-"""Longest time between two positions of an integrated drive [s]: turtlesim's own step."""
 
 STEP = 0.5
 """Time between two poses in the bag [s], our choice: at the robot's own pace each of its halts, of
@@ -120,10 +118,9 @@ def drive(
     start: tuple[float, float, float] = START,
     side: float = SIDE,
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Where commands lead: times (M,) [s], no more than `TICK` apart, and positions (M, 2) [m].
+    """Where commands lead in turtlesim: times (M,) [s], and positions (M, 2) [m].
 
-    A command holds until the next one, but for `HOLD` at most. It is followed along its exact arc;
-    at the edges of the square the robot slides along, as in turtlesim.
+    As `follow` has it; at the edges of the square the robot slides along.
 
     Args:
         times: (N,) when each command comes, ascending [s].
@@ -131,36 +128,5 @@ def drive(
         start: x, y and heading at the first command [m, m, rad].
         side: edge of the square, from (0, 0) [m].
     """
-    last = np.flatnonzero(np.diff(times, append=np.inf) > HOLD)
-    times = np.insert(times, last + 1, times[last] + HOLD)
-    commands = np.insert(commands, last + 1, 0.0, axis=0)
-
-    held = np.diff(times)
-    parts = np.maximum(np.ceil(held / TICK), 1).astype(np.int64)
-    duration = np.repeat(held / parts, parts)
-    forwards, left, rate = np.repeat(commands[:-1], parts, axis=0).T
-    turn = rate * duration
-    # The chord of an arc: it points to where the robot is headed half-way.
-    heading = start[2] + np.cumsum(turn) - turn / 2
-    length = duration * np.sinc(turn / (2 * np.pi))
-    along, across = np.cos(heading) * length, np.sin(heading) * length
-    steps = np.column_stack([forwards * along - left * across, forwards * across + left * along])
-    positions = accumulate(
-        steps, lambda at, step: np.clip(at + step, 0.0, side), initial=np.array(start[:2])
-    )
-    return np.append(times[0], times[0] + np.cumsum(duration)), np.array(list(positions))
-
-
-def fill_jumps(cells: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """The cells (M, 2) entered on the way through the cells (N, 2), each next to the one before.
-
-    Cells in between are those on the straight line; a cell that repeats the one before is left
-    out.
-    """
-    jump = np.diff(cells, axis=0)
-    count = np.abs(jump).max(axis=1, initial=0)
-    jump, before, length = (np.repeat(each, count, axis=0) for each in (jump, cells[:-1], count))
-    ordinal = np.arange(len(length)) - np.repeat(np.cumsum(count) - count, count) + 1
-    # Rounded to the nearest cell, in whole numbers.
-    between = before + (2 * ordinal[:, None] * jump + length[:, None]) // (2 * length[:, None])
-    return np.concatenate([cells[:1], between])
+    times, poses = follow(times, commands, start, HOLD, side)
+    return times, poses[:, :2]
