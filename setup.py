@@ -18,6 +18,7 @@ REQUIREMENTS = [
     "numba>=0.58",
     "numpy>=1.26",
     "pillow>=10.2",
+    "pytransform3d>=3.17",  # Frames that tf joins, where there is no tf2.
     "pyyaml>=6.0",
     "rich>=13.7",
     "rosbags>=0.10.8",  # Codes messages as CDR and knows their type hashes, without ROS.

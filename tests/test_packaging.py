@@ -27,6 +27,7 @@ ROSDEP_KEYS = {
     "numba": "python3-numba",
     "numpy": "python3-numpy",
     "pillow": "python3-pil",
+    "pytransform3d": None,
     "pyyaml": "python3-yaml",
     "rich": "python3-rich",
     "rosbags": "python3-rosbags-pip",
