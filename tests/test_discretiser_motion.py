@@ -212,6 +212,9 @@ def test_gaps_in_time_and_space_begin_episodes() -> None:
     far = [(time + drive[-1][0] + 0.1, x, y) for time, x, y in walk((2.5, 5.5), (4.5, 5.5))]
     visits, _ = visits_of(drive + far)
     assert [visit.led_by is None for visit in visits] == [True, False, False] * 2
+    # Elsewhere for a moment, and back.
+    glance = [*drive, (drive[-1][0] + 0.1, 2.5, 7.5), (drive[-1][0] + 0.2, 2.5, 0.5)]
+    assert visits_of(glance)[0] == visits_of(drive)[0]
     # Played again, or one message overtaken by another.
     visits, _ = visits_of(drive + drive)
     assert [visit.led_by is None for visit in visits] == [True, False, False] * 2

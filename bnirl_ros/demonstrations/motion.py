@@ -19,7 +19,7 @@ from bnirl_ros.mdp.actions import ACTION_SETS, STEPS, action_of_step
 
 _SECOND = 1_000_000_000
 
-_MARGIN = 0.1
+_MARGIN = 0.2
 """How far beyond a cell's edge the robot still counts as in it [cells]: one that stands on an edge
 must not seem to go to and fro as its localisation trembles, nor one that cuts a corner to turn."""
 
@@ -95,6 +95,7 @@ class Discretiser:
         self._moves = moves
         self._pose: _Pose | None = None
         self._visit: Visit | None = None
+        self._told: Visit | None = None  # the last one that was returned
         self._is_waiting = False  # where an episode begins, until it moves
         self._stood_from: _Pose | None = None  # where and since when it stands, if it does
         self._out_since: int | None = None  # when it left its cell, but not far
@@ -171,19 +172,31 @@ class Discretiser:
 
     def _begin(self, pose: _Pose, at_once: bool = False) -> list[Visit]:
         """Begin an episode; unless `at_once`, it is told of when the demonstrator sets out."""
-        self._pose = pose
+        self._pose = self._stood_from = pose
         u, v = pose.along
         cell = (math.floor(u), math.floor(v))
+        told = self._told
+        if (
+            told
+            and 0 <= pose.stamp - told.stamp <= self._silence
+            and max(abs(cell[0] - told.cell[0]), abs(cell[1] - told.cell[1])) <= 1
+        ):
+            # It seemed to be elsewhere for a moment, and nobody could tell this from going on.
+            self._visit, self._is_waiting = told, False
+            return (
+                self._go(replace(pose, stamp=told.stamp), pose, cell) if cell != told.cell else []
+            )
         self._open(cell)
-        self._stood_from = pose
-        visit = self._enter(pose.stamp, cell, None)
         self._is_waiting = not at_once
+        visit = self._enter(pose.stamp, cell, None)
         return [visit] if at_once else []
 
     def _enter(self, stamp: int, cell: _Cell, action: int | None) -> Visit:
         before = self._visit
         led_by = None if action is None or before is None else (before.stamp, action)
         self._visit = Visit(stamp, cell, led_by)
+        if not self._is_waiting:
+            self._told = self._visit
         self._out_since = None
         self._intended[:] = 0.0
         return self._visit
@@ -250,7 +263,7 @@ class Discretiser:
         """The first visit of an episode, once the demonstrator moves or means to."""
         assert self._visit is not None
         self._is_waiting = False
-        self._visit = replace(self._visit, stamp=stamp)
+        self._visit = self._told = replace(self._visit, stamp=stamp)
         return self._visit
 
     def _held_up(self) -> int:
