@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from bnirl_ros import __version__
 from bnirl_ros.errors import InputError
@@ -30,6 +30,10 @@ if TYPE_CHECKING:  # what a command needs is imported when it runs, so that --he
 
 REPRODUCIBLE = ("4.1", "4.2", "4.3", "table1", "all")
 """What `bnirl reproduce` can be asked for."""
+
+
+_Table = TypeVar("_Table", bound=Any)
+"""A class of settings."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -145,6 +149,7 @@ def _add_inference(parser: argparse.ArgumentParser) -> None:
         metavar="SECONDS",
         help="longest time between two poses of one episode (%(default)s)",
     )
+    _add_discretising(parser)
 
 
 def _add_reproduce(parser: argparse.ArgumentParser) -> None:
@@ -200,11 +205,29 @@ def _cell(text: str) -> tuple[int, int]:
 
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
-    """An option for every setting, with its range and default."""
+    """An option for every setting of the inference."""
     from bnirl_ros.inference.settings import Settings
+
+    _add_options(parser, Settings)
+
+
+def _add_discretising(parser: argparse.ArgumentParser) -> None:
+    """An option for every setting by which a raw bag becomes a demonstration."""
+    from bnirl_ros.demonstrations.discretising import Discretising
+
+    group = parser.add_argument_group(
+        "a bag without pose and action",
+        "where the robot was is taken from odometry, AMCL's or other stamped poses, tf, or "
+        "velocity commands, and put on a planning map with larger cells",
+    )
+    _add_options(group, Discretising)
+
+
+def _add_options(parser: argparse._ActionsContainer, table: type) -> None:
+    """An option for every field of a table of settings, with its range and default."""
     from bnirl_ros.limits import kind_of, limits_of
 
-    for setting in fields(Settings):
+    for setting in fields(table):
         limits = limits_of(setting)
         words = limits.range_in_words()
         parser.add_argument(
@@ -214,16 +237,23 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
             choices=limits.choices or None,
             metavar=None if limits.choices else setting.name.upper(),
             help=(f"{limits.description}{', ' * bool(words)}{words}").replace("%", "%%")
-            + ("" if setting.default is None else " (%(default)s)"),
+            + ("" if setting.default in (None, "") else " (%(default)s)"),
         )
 
 
 def _settings(parser: argparse.ArgumentParser, options: argparse.Namespace) -> Settings:
     from bnirl_ros.inference.settings import Settings
 
-    values = {setting.name: getattr(options, setting.name) for setting in fields(Settings)}
+    return _table(Settings, parser, options)
+
+
+def _table(
+    table: type[_Table], parser: argparse.ArgumentParser, options: argparse.Namespace
+) -> _Table:
+    """What the options say of a table of settings."""
+    values = {setting.name: getattr(options, setting.name) for setting in fields(table)}
     try:
-        return Settings(**values)
+        return table(**values)
     except InputError as error:
         parser.error(str(error))
 
@@ -282,7 +312,7 @@ def _predict(options: argparse.Namespace) -> int:
     for path in options.held_out:
         if path.resolve() == options.demonstration.resolve():
             _warn(f"{path}: is what was learnt from; how well it is foreseen tells little")
-        held_out, _, also_damaged = _placed(path, grid_map, options, settings, remappings)
+        held_out, _, also_damaged = _placed(path, grid_map, options, settings, remappings, True)
         others.append((str(path), held_out))
         damage = damage or also_damaged
     check_writable(options.out)
@@ -452,24 +482,41 @@ def _placed(
     options: argparse.Namespace,
     settings: Settings,
     remappings: Mapping[str, str],
+    as_given: bool = False,
 ) -> tuple[Demonstration, GridMap, str | None]:
-    """A demonstration on a given map, or the bag's own; the map; and a sentence on damage."""
+    """A demonstration on a given map, or the bag's own; the map; and a sentence on damage.
+
+    A raw bag is put on a planning map that is made of the given one, unless that is to be taken
+    as given.
+    """
     if given_map is not None and _is_csv(path):
         from bnirl_ros.demonstrations.csv_file import read_csv
 
         return read_csv(path, given_map, settings.moves), given_map, None
 
     from bnirl_ros.bags.demonstration import read_demonstration
+    from bnirl_ros.bags.raw_demonstration import is_raw, read_raw_demonstration
+    from bnirl_ros.demonstrations.discretising import Discretising
     from bnirl_ros.demonstrations.placement import place
 
-    recorded = read_demonstration(path, remappings)
-    grid_map = given_map or recorded.grid_map
+    discretising = _table(Discretising, options.command, options)
+    episode_gap = options.episode_gap
+    if is_raw(path, discretising, remappings):
+        recorded, words = read_raw_demonstration(
+            path, discretising, given_map, settings.moves, remappings.get("map", "map")
+        )
+        print(f"Discretised: {words}")
+        grid_map = given_map if as_given else recorded.grid_map
+        episode_gap = discretising.longest_silence
+    else:
+        recorded = read_demonstration(path, remappings)
+        grid_map = given_map or recorded.grid_map
     for warning in recorded.warnings:
         _warn(warning)
     if grid_map is None:
         reasons = "".join(f" ({fault})" for fault in recorded.faults if "map" in fault)
         raise InputError(f"{path}: has no map that can be used{reasons}; give one with --map")
-    placement = place(recorded.recording, grid_map, settings.moves, options.episode_gap)
+    placement = place(recorded.recording, grid_map, settings.moves, episode_gap)
     for fault, count in (recorded.faults + placement.faults).items():
         _warn(f"{path}: left out {count} x {fault}")
     if len(placement.demonstration) == 0:

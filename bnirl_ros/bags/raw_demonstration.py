@@ -1,0 +1,443 @@
+"""A bag of what robots publish anyway - odometry, poses, tf, commands - as a recording."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from bnirl_ros.bags.cdr import decode
+from bnirl_ros.bags.demonstration import RecordedDemonstration, absolute
+from bnirl_ros.bags.reader import Bag, Topic
+from bnirl_ros.demonstrations.discretising import Discretising
+from bnirl_ros.demonstrations.frames import TransformBuffer, frame_name
+from bnirl_ros.demonstrations.messages import TOPIC_TYPES, map_of, stamp_of
+from bnirl_ros.demonstrations.motion import Discretiser, record
+from bnirl_ros.demonstrations.raw_messages import (
+    COMMAND_TYPES,
+    NO_MOTION,
+    POSE_TYPES,
+    TF,
+    Command,
+    command_of,
+    pose_of,
+)
+from bnirl_ros.demonstrations.recording import Recorder
+from bnirl_ros.demonstrations.velocity import follow
+from bnirl_ros.errors import InputError
+from bnirl_ros.maps.coarsening import coarsen
+from bnirl_ros.maps.grid_map import GridMap
+from bnirl_ros.maps.occupancy import check_geometry
+
+_SECOND = 1_000_000_000
+
+_KINDS = (*POSE_TYPES, TF, *COMMAND_TYPES)
+"""Message types that tell motion, in the order in which they are tried."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Told:
+    """Poses as they were told, each in its own frame.
+
+    Attributes:
+        stamps: (P,) [ns].
+        frames: (P,) names of their frames.
+        points: (P, 4) homogeneous positions [m].
+        headings: (P,) [rad].
+        arrivals: (P,) log times [ns].
+    """
+
+    stamps: npt.NDArray[np.int64]
+    frames: npt.NDArray[np.object_]
+    points: npt.NDArray[np.float64]
+    headings: npt.NDArray[np.float64]
+    arrivals: npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """Motion in the frame of the map.
+
+    Attributes:
+        stamps: (P,) [ns].
+        poses: (P, 3) x, y and heading [m, m, rad].
+        arrivals: (P,) log times [ns].
+        words: what tells it, for the report.
+    """
+
+    stamps: npt.NDArray[np.int64]
+    poses: npt.NDArray[np.float64]
+    arrivals: npt.NDArray[np.int64]
+    words: str
+
+
+def is_raw(
+    path: str | Path,
+    settings: Discretising,
+    remappings: Mapping[str, str] = MappingProxyType({}),
+) -> bool:
+    """Whether a bag is to be discretised: a source is named, or pose and action are not in it.
+
+    Args:
+        path: the bag.
+        settings: which may name a source.
+        remappings: as of `read_demonstration`; who names a topic of poses or actions has them.
+
+    Raises:
+        InputError: the bag cannot be read.
+    """
+    if settings.source:
+        return True
+    bag = Bag(path)
+    types = {topic.name: topic.type_name for topic in bag.topics()}
+    there = all(types.get(absolute(name)) == TOPIC_TYPES[name] for name in ("pose", "action"))
+    return not (there or {"pose", "action"} & set(remappings)) and bool(_sources(bag))
+
+
+def read_raw_demonstration(
+    path: str | Path,
+    settings: Discretising,
+    grid_map: GridMap | None = None,
+    moves: int = 8,
+    map_topic: str = "map",
+) -> tuple[RecordedDemonstration, str]:
+    """Read what a robot published while it was driven, and put it on a planning map.
+
+    Args:
+        path: the bag.
+        settings: which topics to take, and how to discretise them.
+        grid_map: the map; None takes the bag's or, where that has none, open space.
+        moves: 4 or 8: which actions there are.
+        map_topic: the recorded topic of the map.
+
+    Returns:
+        The demonstration, whose map is the planning map, and a sentence on what it was made of.
+        Its episodes are told apart by gaps of more than `longest_silence`.
+
+    Raises:
+        InputError: the bag cannot be read, or tells no motion that can be brought into the frame
+            of the map; the sentence tells why and what to do.
+    """
+    reading = _Reading(Bag(path), settings)
+    if grid_map is None:
+        grid_map = reading.last_map(absolute(map_topic))
+    if grid_map is not None and settings.map_frame:
+        grid_map = replace(grid_map, frame_id=settings.map_frame)
+    frame_id = grid_map.frame_id if grid_map else settings.map_frame or "map"
+    motion = reading.motion(frame_id)
+    intent = absolute(settings.intent) if settings.intent else ""
+    commands = list(reading.commands(intent)) if intent else []
+
+    if grid_map is None:
+        planning = _open_space(
+            motion.poses[:, :2], settings.planning_resolution, frame_id, str(path)
+        )
+        height, width = planning.free.shape
+        reading.warnings.append(
+            f"{path}: has no map, so that the robot's surroundings, {width} x {height} cells, are "
+            "taken for open space; give one with --map"
+        )
+    else:
+        try:
+            coarsened = coarsen(grid_map, settings.planning_resolution, settings.robot_radius)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+        planning = coarsened.grid_map
+        if coarsened.through_walls:
+            reading.warnings.append(
+                f"planning map: {coarsened.through_walls} pairs of free cells have a wall between "
+                "them that cells so large cannot show; take a lower planning resolution"
+            )
+    discretiser, recorder = Discretiser(planning, settings, moves), Recorder()
+    recorder.map_arrived()
+    heard = 0
+    for stamp, pose, arrival in zip(
+        motion.stamps.tolist(), motion.poses.tolist(), motion.arrivals.tolist(), strict=True
+    ):
+        while heard < len(commands) and commands[heard][0] <= arrival:
+            command = commands[heard][1]
+            discretiser.hear(command.forwards, command.left)
+            heard += 1
+        for visit in discretiser.follow(stamp, *pose):
+            record(recorder, visit, planning)
+    if discretiser.opened:
+        reading.warnings.append(
+            _on_opened(discretiser.opened, planning, motion.poses[:, :2], grid_map)
+        )
+    recording = recorder.snapshot()
+    if not len(recording.actions):
+        raise InputError(
+            f"{path}: by {motion.words} the robot never leaves a cell of {planning.resolution:g} m"
+            "; take a lower planning resolution, or another source"
+        )
+    words = (
+        f"{len(recording.pose_stamps)} visits of cells of {planning.resolution:g} m from "
+        f"{len(motion.stamps)} poses: {motion.words}"
+    )
+    if intent:
+        words += f"; intent from {intent} ({len(commands)} commands)"
+    demonstration = RecordedDemonstration(
+        recording=recording,
+        grid_map=discretiser.grid_map,
+        faults=reading.faults + discretiser.faults,
+        warnings=(*reading.bag.warnings, *reading.warnings),
+        damage=reading.bag.damage,
+    )
+    return demonstration, words
+
+
+class _Reading:
+    """A bag that is being read: what was wrong with its messages is counted here."""
+
+    def __init__(self, bag: Bag, settings: Discretising) -> None:
+        self.bag = bag
+        self.faults: Counter[str] = Counter()
+        self.warnings: list[str] = []
+        self._settings = settings
+        self._transforms: TransformBuffer | None = None
+        self._clock = np.zeros((0, 2), dtype=np.int64)
+
+    def last_map(self, topic: str) -> GridMap | None:
+        """The last map on a topic that can be used."""
+        found = None
+        kinds = {each.type_name for each in self.bag.topics() if each.name == topic}
+        if kinds and kinds != {TOPIC_TYPES["map"]}:
+            self.warnings.append(
+                f"{self.bag.path}: topic {topic} is of type {', '.join(kinds)}, not "
+                f"{TOPIC_TYPES['map']}; name the right one with --remap map:=/topic"
+            )
+            return None
+        for _, message in self._messages(topic, TOPIC_TYPES["map"]):
+            try:
+                found = map_of(message, f"{self.bag.path}, topic {topic}")
+            except InputError as error:
+                self.faults[str(error)] += 1
+        return found
+
+    def motion(self, frame_id: str) -> _Motion:
+        """The motion that the wanted source tells, or the first one that can be used."""
+        sources = _sources(self.bag)
+        if self._settings.source:
+            wanted = absolute(self._settings.source)
+            sources = [topic for topic in sources if topic.name == wanted]
+        refusals = []
+        for topic in sources:
+            faults: Counter[str] = Counter()
+            try:
+                motion = self._motion_of(topic, frame_id, faults)
+            except InputError as refusal:
+                refusals.append(str(refusal))
+            else:
+                self.faults += faults
+                self.warnings += [f"{self.bag.path}: {refusal}" for refusal in refusals]
+                return motion
+        if refusals:
+            raise InputError(f"{self.bag.path}: {'; '.join(refusals)}")
+        there = ", ".join(f"{topic.name} ({topic.type_name})" for topic in self.bag.topics())
+        raise InputError(
+            f"{self.bag.path}: {self._settings.source or 'no topic'} tells no motion; there are "
+            f"{there or 'no topics'}; name one of {', '.join(_KINDS)} with --source"
+        )
+
+    def commands(self, topic: str) -> Iterator[tuple[int, Command]]:
+        """The velocity commands on a topic, each with its log time [ns]."""
+        types = {each.name: each.type_name for each in self.bag.topics()}
+        if types.get(topic) not in COMMAND_TYPES:
+            raise InputError(
+                f"{self.bag.path}: has no velocity commands ({' or '.join(COMMAND_TYPES)}) on "
+                f"{topic}; name another topic with --intent, or none"
+            )
+        for log_time, message in self._messages(topic, types[topic]):
+            yield log_time, command_of(message)
+
+    def _motion_of(self, topic: Topic, frame_id: str, faults: Counter[str]) -> _Motion:
+        """The motion that a topic tells.
+
+        Raises:
+            InputError: it tells none that can be used; the sentence names the topic.
+        """
+        if topic.type_name in COMMAND_TYPES:
+            return self._followed(topic)
+        told = self._told_by_tf() if topic.type_name == TF else self._told(topic)
+        poses = np.full((len(told.stamps), 3), np.nan)
+        moved_from = []
+        for frame in dict.fromkeys(told.frames.tolist()):
+            here = told.frames == frame
+            matrices = self._tf().look_up(frame_id, frame, told.stamps[here])
+            if matrices is None:
+                where = f"frame {frame!r}, which tf does not join to {frame_id!r}"
+                faults[f"pose of {topic.name} in {where}"] += int(np.count_nonzero(here))
+                continue
+            if frame != frame_name(frame_id):
+                moved_from.append(frame)
+            poses[here] = _moved(matrices, told.points[here], told.headings[here])
+            unknown = int(np.count_nonzero(np.isnan(matrices[:, 0, 0])))
+            if unknown:
+                faults[f"pose of {topic.name} at a time of which tf tells nothing"] += unknown
+        lost = ~np.isfinite(told.points).all(axis=1) | ~np.isfinite(told.headings)
+        if lost.any():
+            faults["pose with a coordinate that is not finite"] += int(np.count_nonzero(lost))
+        known = np.isfinite(poses).all(axis=1)
+        if not known.any():
+            reasons = ", ".join(f"{count} x {fault}" for fault, count in faults.items())
+            raise InputError(
+                f"{topic.name} tells no pose that can be used ({reasons or 'it has none'}); name "
+                "another topic with --source, or the frames with --map-frame and --base-frame"
+            )
+        words = f"{topic.name} ({topic.type_name})"
+        if moved_from:
+            words += f", brought from {' and '.join(moved_from)} to {frame_id} by tf"
+        return _Motion(told.stamps[known], poses[known], told.arrivals[known], words)
+
+    def _told(self, topic: Topic) -> _Told:
+        arrivals, poses = [], []
+        for log_time, message in self._messages(topic.name, topic.type_name):
+            arrivals.append(log_time)
+            poses.append(pose_of(message))
+        return _Told(
+            stamps=np.array([pose.stamp for pose in poses], dtype=np.int64),
+            frames=np.array([pose.frame_id for pose in poses], dtype=np.object_),
+            points=np.array([(*pose.position, 1.0) for pose in poses]).reshape(-1, 4),
+            headings=np.array([pose.heading for pose in poses], dtype=np.float64),
+            arrivals=np.array(arrivals, dtype=np.int64),
+        )
+
+    def _told_by_tf(self) -> _Told:
+        """The robot's own frame, in which it is at the origin, whenever tf tells of it."""
+        frame = frame_name(self._settings.base_frame)
+        stamps = self._tf().stamps_of(frame)
+        if not len(stamps):
+            frames = ", ".join(self._tf().frames)
+            raise InputError(
+                f"tf does not tell how {frame!r} moves; name one of {frames} with --base-frame"
+            )
+        return _Told(
+            stamps=stamps,
+            frames=np.full(len(stamps), frame, dtype=np.object_),
+            points=np.tile([0.0, 0.0, 0.0, 1.0], (len(stamps), 1)),
+            headings=np.zeros(len(stamps)),
+            arrivals=np.interp(stamps, *self._clock.T).astype(np.int64),
+        )
+
+    def _followed(self, topic: Topic) -> _Motion:
+        """Where velocity commands alone lead."""
+        if not self._settings.start:
+            raise InputError(
+                f"{topic.name} has velocity commands, which tell no place; give the pose from "
+                "which they are followed with --start x,y,heading"
+            )
+        stamps, commands = [], []
+        for log_time, message in self._messages(topic.name, topic.type_name):
+            command = command_of(message)
+            if not all(map(math.isfinite, command)):
+                self.faults["velocity command that is not finite"] += 1
+                continue
+            stamped = topic.type_name == COMMAND_TYPES[0]
+            stamps.append(stamp_of(message) if stamped else log_time)
+            commands.append(command)
+        if not commands:
+            raise InputError(f"{topic.name} has no velocity command that can be used")
+        order = np.argsort(stamps, kind="stable")
+        times = (np.array(stamps, dtype=np.int64)[order] - min(stamps)) / _SECOND
+        hold = self._settings.command_hold
+        at, poses = follow(times, np.array(commands)[order], self._settings.start_pose, hold)
+        # Nobody knows what happened while nothing was commanded for long.
+        since = at - times[np.searchsorted(times, at, side="right") - 1]
+        until = np.append(times, np.inf)[np.searchsorted(times, at, side="right")] - at
+        known = (since <= hold) | (since + until <= self._settings.longest_silence)
+        at, poses = at[known], poses[known]
+        moments = min(stamps) + np.rint(at * _SECOND).astype(np.int64)
+        x, y, heading = self._settings.start_pose
+        words = f"{topic.name} ({topic.type_name}), followed from ({x:g}, {y:g}), {heading:g} rad"
+        return _Motion(moments, poses, moments, words)
+
+    def _tf(self) -> TransformBuffer:
+        """All transforms of the bag."""
+        if self._transforms is None:
+            self._transforms = TransformBuffer()
+            clock = []
+            for topic in self.bag.topics():
+                if topic.type_name == TF:
+                    static = topic.name.endswith("tf_static")
+                    for log_time, message in self._messages(topic.name, TF):
+                        self._transforms.add(message, static)
+                        clock += [
+                            (stamp_of(each), log_time) for each in message.transforms if not static
+                        ]
+            self._clock = np.array(sorted(clock), dtype=np.int64).reshape(-1, 2)
+            self.faults += self._transforms.faults
+        return self._transforms
+
+    def _messages(self, topic: str, type_name: str) -> Iterator[tuple[int, Any]]:
+        """The messages on a topic, each with its log time [ns]; what cannot be read is counted."""
+        for raw in self.bag.messages([topic]):
+            try:
+                yield raw.log_time, decode(type_name, raw.data)
+            except InputError as error:
+                self.faults[str(error)] += 1
+
+
+def _sources(bag: Bag) -> list[Topic]:
+    """The topics that tell motion by kind, and of a kind those with the most messages first."""
+    found = [
+        topic
+        for topic in bag.topics()
+        if topic.type_name in _KINDS
+        and topic.messages
+        and not topic.name.endswith((*NO_MOTION, "tf_static"))
+    ]
+    return sorted(found, key=lambda topic: (_KINDS.index(topic.type_name), -topic.messages))
+
+
+def _moved(
+    matrices: npt.NDArray[np.float64],
+    points: npt.NDArray[np.float64],
+    headings: npt.NDArray[np.float64],
+) -> npt.NDArray[np.float64]:
+    """(P, 3) x, y and heading of poses after a transform each."""
+    positions = np.einsum("pij,pj->pi", matrices, points)
+    ahead = np.column_stack([np.cos(headings), np.sin(headings)])
+    turned = np.einsum("pij,pj->pi", matrices[:, :2, :2], ahead)
+    return np.column_stack([positions[:, :2], np.arctan2(turned[:, 1], turned[:, 0])])
+
+
+def _open_space(
+    positions: npt.NDArray[np.float64], resolution: float, frame_id: str, source: str
+) -> GridMap:
+    """A map without obstacles round positions (P, 2) [m], with a margin of a cell."""
+    low = np.floor(positions.min(axis=0) / resolution) - 1
+    high = np.floor(positions.max(axis=0) / resolution) + 2
+    width, height = (int(size) for size in high - low)
+    x, y = (low * resolution).tolist()
+    check_geometry(width, height, resolution, (x, y, 0.0), source)
+    return GridMap(np.ones((height, width), dtype=np.bool_), resolution, (x, y, 0.0), frame_id)
+
+
+def _on_opened(
+    opened: Sequence[tuple[int, int]],
+    planning: GridMap,
+    positions: npt.NDArray[np.float64],
+    grid_map: GridMap | None,
+) -> str:
+    """The sentence on cells that were opened since the robot was in them."""
+    named = ", ".join(f"({x}, {y})" for x, y in opened[:5]) + (", ..." if len(opened) > 5 else "")
+    sentence = (
+        f"planning map: the robot was in {len(opened)} blocked cells of {planning.resolution:g} m,"
+        f" which are open now: {named}"
+    )
+    assert grid_map is not None  # or there would be no blocked cells
+    where_free = positions[grid_map.is_free(grid_map.cells_of(positions))]
+    closed = {(x, y) for x, y in planning.cells_of(where_free).tolist()} & set(opened)
+    if closed:
+        sentence += (
+            f"; {len(closed)} of them only the coarsening had closed, for which the robot radius "
+            "or the planning resolution is too large"
+        )
+    return sentence
