@@ -342,9 +342,12 @@ def test_what_cannot_be_read_is_named(
         read(write(tmp_path / "bag", messages), **settings)
 
 
-def test_bags_with_pose_and_action_are_left_as_they_are() -> None:
+def test_bags_with_pose_and_action_are_left_as_they_are(tmp_path: Path) -> None:
     assert not is_raw(BAGS / "paper_loop", Discretising())
     assert is_raw(BAGS / "paper_loop", Discretising(source="/pose"))
+    poses = write(tmp_path / "poses", SOURCES["/robot/pose"])
+    assert is_raw(poses, Discretising(), {"map": "/robot/map"})
+    assert not is_raw(poses, Discretising(), {"pose": "/robot/pose"})
     # What was discretised and is so again is the same.
     before = read_demonstration(BAGS / "paper_loop")
     recorded, _ = read(

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bnirl_ros.demonstrations.frames import TransformBuffer
@@ -65,6 +65,7 @@ poses = st.tuples(numbers, numbers, st.floats(-3, 3))
 
 
 @given(poses, poses, poses)
+@settings(max_examples=30)
 def test_a_chain_is_joined_in_both_directions(
     first: tuple[float, float, float],
     second: tuple[float, float, float],

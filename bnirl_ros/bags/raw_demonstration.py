@@ -83,7 +83,7 @@ def is_raw(
     settings: Discretising,
     remappings: Mapping[str, str] = MappingProxyType({}),
 ) -> bool:
-    """Whether a bag is to be discretised: a source is named, or pose and action are not in it.
+    """Whether a bag is to be discretised: a source is named, or only raw motion is in it.
 
     Args:
         path: the bag.
@@ -95,10 +95,16 @@ def is_raw(
     """
     if settings.source:
         return True
+    if {"pose", "action"} & set(remappings):
+        return False
     bag = Bag(path)
-    types = {topic.name: topic.type_name for topic in bag.topics()}
-    there = all(types.get(absolute(name)) == TOPIC_TYPES[name] for name in ("pose", "action"))
-    return not (there or {"pose", "action"} & set(remappings)) and bool(_sources(bag))
+    # Actions under another name are to be named: nothing else is called so and of that type.
+    actions = [
+        topic
+        for topic in bag.topics()
+        if topic.type_name == TOPIC_TYPES["action"] and topic.name.endswith("action")
+    ]
+    return not actions and bool(_sources(bag))
 
 
 def read_raw_demonstration(
