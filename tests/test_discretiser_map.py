@@ -45,7 +45,7 @@ def joined(free: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
         np.bool_, st.tuples(st.integers(4, 24), st.integers(4, 24)), elements=st.booleans()
     )
     | arrays(np.bool_, (20, 20), elements=st.sampled_from([True] * 9 + [False])),
-    ratio=st.sampled_from([2.0, 2.5, 3.0, 5.0]),
+    ratio=st.sampled_from([2.0, 2.4, 3.0, 5.0]),  # no centre of a finer cell on an edge
     radius=st.sampled_from([0.02, 0.1, 0.15, 0.25]),
 )
 def test_whatever_the_disc_can_drive_to_can_be_driven_to(

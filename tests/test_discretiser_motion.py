@@ -212,9 +212,12 @@ def test_gaps_in_time_and_space_begin_episodes() -> None:
     far = [(time + drive[-1][0] + 0.1, x, y) for time, x, y in walk((2.5, 5.5), (4.5, 5.5))]
     visits, _ = visits_of(drive + far)
     assert [visit.led_by is None for visit in visits] == [True, False, False] * 2
-    # Elsewhere for a moment, and back.
-    glance = [*drive, (drive[-1][0] + 0.1, 2.5, 7.5), (drive[-1][0] + 0.2, 2.5, 0.5)]
-    assert visits_of(glance)[0] == visits_of(drive)[0]
+    # Elsewhere for a moment, and back to drive on.
+    end = drive[-1][0]
+    glance = [*drive, (end + 0.1, 2.5, 7.5), (end + 0.2, 2.5, 0.5)]
+    glance += [(end + 0.2 + time, x, y) for time, x, y in walk((2.5, 0.5), (4.5, 0.5))]
+    visits, _ = visits_of(glance)
+    assert [visit.led_by is None for visit in visits] == [True, False, False, False, False]
     # Played again, or one message overtaken by another.
     visits, _ = visits_of(drive + drive)
     assert [visit.led_by is None for visit in visits] == [True, False, False] * 2

@@ -137,9 +137,6 @@ class TransformBuffer:
         for (child, parent), (stamps, values) in self._moving.items():
             stamp, first = np.unique(np.asarray(stamps), return_index=True)
             pqs = np.asarray(values).reshape(-1, 7)[first]
-            # A quaternion and its negative are the same turn: take the one next to the last.
-            flips = np.sum(pqs[1:, 3:] * pqs[:-1, 3:], axis=1) < 0.0
-            pqs[1:, 3:] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, np.newaxis]
             time = (stamp - self._origin) / _SECOND
             manager.add_transform(child, parent, KnownForATime(time, pqs))
         self._manager = manager
