@@ -101,6 +101,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     predict.set_defaults(run=_predict, command=predict)
 
+    _add_waypoints(
+        commands.add_parser(
+            "waypoints", help="write the subgoals as waypoints for Nav2, and as GeoJSON"
+        )
+    )
+
     _add_reproduce(commands.add_parser("reproduce", help="run the paper's experiments again"))
 
     commands.add_parser("replay", help="play a recorded demonstration onto its topics")
@@ -150,6 +156,28 @@ def _add_inference(parser: argparse.ArgumentParser) -> None:
         help="longest time between two poses of one episode (%(default)s)",
     )
     _add_discretising(parser)
+
+
+def _add_waypoints(parser: argparse.ArgumentParser) -> None:
+    """The options of `bnirl waypoints`."""
+    parser.description = (
+        "Write the subgoals in the order in which they were visited, each heading for the next: "
+        "waypoints.yaml, which Nav2's RViz panel and subgoal_node load, and waypoints.geojson."
+    )
+    parser.add_argument(
+        "subgoals", metavar="SUBGOALS_JSON", type=Path, help="the subgoals.json of an inference"
+    )
+    parser.add_argument("--out", type=Path, help="folder for the files (that of SUBGOALS_JSON)")
+    parser.add_argument(
+        "--datum",
+        nargs=3,
+        type=float,
+        metavar=("LAT", "LON", "YAW"),
+        help="latitude and longitude [degrees] of the map frame's origin, and its x axis "
+        "counter-clockwise from east [rad]: write longitudes and latitudes into waypoints.geojson "
+        "(metres of the map frame)",
+    )
+    parser.set_defaults(run=_waypoints, command=parser)
 
 
 def _add_reproduce(parser: argparse.ArgumentParser) -> None:
@@ -330,6 +358,29 @@ def _predict(options: argparse.Namespace) -> int:
     print(f"learnt from {convergence(summarise(posterior, grid_map))}")
     print(f"Written: {', '.join(str(file) for file in written)}")
     return _told_of(damage)
+
+
+def _waypoints(options: argparse.Namespace) -> int:
+    """`bnirl waypoints`: from subgoals.json to waypoints.yaml and waypoints.geojson."""
+    from bnirl_ros.maps.datum import Datum
+    from bnirl_ros.views.results import read_visits
+    from bnirl_ros.views.waypoint_files import PANEL_FRAME, write_waypoints
+
+    try:
+        datum = Datum(*options.datum) if options.datum else None
+    except InputError as error:
+        options.command.error(f"argument --{error}")
+    visits = read_visits(options.subgoals)
+    out: Path = options.out or options.subgoals.parent
+    written = write_waypoints(out, visits, datum)
+    if visits.frame_id != PANEL_FRAME:
+        _warn(
+            f"{written[0]}: is in the frame {visits.frame_id}; Nav2's RViz panel, which reads no "
+            f"frame, would take it to be in {PANEL_FRAME}"
+        )
+    print(f"Waypoints in the frame {visits.frame_id}: {len(visits.subgoals)}")
+    print(f"Written: {', '.join(str(file) for file in written)}")
+    return 0
 
 
 def _foreseen(

@@ -1,4 +1,4 @@
-"""Maps: occupancy, Nav2 map files, text grids and features; the way between cells and metres.
+"""Maps: occupancy, Nav2 map files, text grids and features; cells, metres and the earth.
 
 A map knows which cells are free, where they lie and what features they have; what anybody does on
 it is not its business.

@@ -32,7 +32,7 @@ def read_keys(path: Path, remedy: str, needed: str) -> Mapping[str, Any]:
         content = yaml.safe_load(path.read_bytes())
     except OSError as error:
         raise InputError(
-            f"{path}: the map file cannot be read ({error.strerror}); check the path"
+            f"{path}: the file cannot be read ({error.strerror}); check the path"
         ) from None
     # PyYAML lets ValueError through for impossible dates, RecursionError for deep nesting.
     except (yaml.YAMLError, ValueError, RecursionError) as error:

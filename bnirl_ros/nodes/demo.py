@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -27,7 +26,7 @@ from bnirl_ros.nodes.process import run
 from bnirl_ros.nodes.subgoal_node import OUTPUTS
 from bnirl_ros.resources import share_folder
 from bnirl_ros.views.messages import DiagnosticArray
-from bnirl_ros.views.results import subgoals_in
+from bnirl_ros.views.results import read_document, subgoals_in
 from bnirl_ros.views.tables import subgoal_table
 
 _RECORDED = {
@@ -142,7 +141,7 @@ def demo(bag: Path, out: Path) -> None:
 
 def _show(out: Path) -> None:
     """Print the table, and where everything is."""
-    document = json.loads((out / "subgoals.json").read_text(encoding="utf-8"))
+    document = read_document(out / "subgoals.json")
     diagnostics = document["diagnostics"]
     rhat = diagnostics["rhat"]
     print(subgoal_table(subgoals_in(document), document["visit_sequence"]))

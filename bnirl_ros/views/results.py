@@ -21,6 +21,7 @@ from bnirl_ros.maps.grid_map import GridMap
 from bnirl_ros.model.pursuits import PRIORS
 from bnirl_ros.views.plot import draw_summary
 from bnirl_ros.views.pursuits import knows_pursuits, pursuits_by_episode
+from bnirl_ros.views.waypoints import Visits, visits_in_order
 
 FORMAT = 1
 """Format number of subgoals.json; added fields keep it."""
@@ -211,6 +212,75 @@ def subgoals_in(document: Mapping[str, Any]) -> tuple[Subgoal, ...]:
         )
         for entry in document["subgoals"]
     )
+
+
+def read_document(path: Path) -> Mapping[str, Any]:
+    """The content of a subgoals.json.
+
+    Raises:
+        InputError: the file cannot be read, is no JSON, or has another format number.
+    """
+    try:
+        document = json.loads(path.read_bytes())
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); give the subgoals.json of bnirl infer"
+        ) from None
+    # json lets through UnicodeDecodeError, a ValueError, and RecursionError for deep nesting.
+    except (ValueError, RecursionError):
+        raise InputError(
+            f"{path}: this is not valid JSON; give the subgoals.json of bnirl infer"
+        ) from None
+    if not isinstance(document, Mapping) or "format" not in document:
+        raise InputError(f"{path}: has no format number; give the subgoals.json of bnirl infer")
+    if document["format"] != FORMAT:
+        raise InputError(
+            f"{path}: has the format {document['format']!r} where only {FORMAT} is known; infer "
+            "again with this version"
+        )
+    return document
+
+
+def read_visits(path: Path) -> Visits:
+    """The subgoals of a subgoals.json in the order in which they were visited, at least one.
+
+    Raises:
+        InputError: as `read_document`, and where a field is missing or means nothing, or no
+            subgoal was visited.
+    """
+    document = read_document(path)
+    try:
+        subgoals, sequence = subgoals_in(document), document["visit_sequence"]
+        if set(sequence) - {subgoal.rank for subgoal in subgoals}:
+            raise ValueError("'visit_sequence' has a rank that no subgoal has")
+        repetitions = document.get("repetitions", 0)
+        visits = visits_in_order(subgoals, sequence, repetitions, document["frame_id"])
+        _check_visits(visits)
+    except KeyError as error:
+        fault = f"{error.args[0]!r} is missing"
+    except (TypeError, ValueError, IndexError, OverflowError, AttributeError) as error:
+        fault = str(error)
+    else:
+        if not visits.subgoals:
+            raise InputError(
+                f"{path}: tells of no subgoal that was visited; infer from a longer demonstration"
+            )
+        return visits
+    raise InputError(f"{path}: is not as bnirl infer writes it ({fault}); infer again")
+
+
+def _check_visits(visits: Visits) -> None:
+    """Raise ValueError, or TypeError, where a field is not what it should be."""
+    if not isinstance(visits.frame_id, str) or not visits.frame_id:
+        raise ValueError("'frame_id' is no name")
+    ranks = [subgoal.rank for subgoal in visits.subgoals]
+    if len(set(ranks)) < len(ranks):
+        raise ValueError("'visit_sequence' has a rank twice")
+    for subgoal in visits.subgoals:
+        numbers = [*subgoal.position, subgoal.probability, *subgoal.visit_order]
+        numbers += [] if subgoal.pursuits is None else [subgoal.pursuits]
+        if not all(math.isfinite(number) for number in numbers):
+            raise ValueError(f"the subgoal of rank {subgoal.rank} has a number that is not finite")
 
 
 def posterior_arrays(posterior: Posterior) -> dict[str, npt.NDArray[Any]]:
