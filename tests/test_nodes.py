@@ -30,6 +30,9 @@ from bnirl_ros.experiments.scenarios import PAPER_LOOP
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.maps import GridMap
 from bnirl_ros.views.messages import MESSAGE_TYPES
+from bnirl_ros.views.stamped import pose_of
+from bnirl_ros.views.waypoint_files import waypoints_yaml
+from bnirl_ros.views.waypoints import Waypoints, path_of
 from demonstration_support import (
     BAD_COUNTS,
     BAGS,
@@ -424,6 +427,31 @@ def test_who_comes_late_gets_all_four_outputs(
         assert received == node.outputs[topic][-1:]
 
 
+def test_saved_waypoints_are_served_until_there_is_a_posterior(
+    subgoals: Callable[..., Subgoals], tmp_path: Path
+) -> None:
+    saved = Waypoints("map", (pose_of((1.5, -2.0), 0.5), pose_of((3.5, 4.25), -2.5)))
+    (tmp_path / "waypoints.yaml").write_text(waypoints_yaml(saved))
+    node = subgoals(**QUICK, waypoints_file=tmp_path / "waypoints.yaml")
+    paths = node.outputs["waypoints"]
+
+    def served() -> bool:
+        return bool(paths) and paths[-1] == to_ros(path_of(saved, stamp_of(paths[-1])))
+
+    node.peer.until(served, "the saved waypoints, with nothing else known")
+    node.send([map_of_grid()])
+    node.peer.until(lambda: node.outputs["subgoals"], "an empty set, for a map and nothing else")
+    node.peer.rest(0.3)
+    assert served()
+    node.send(walk())
+    node.until_settled(OBSERVATIONS_OF_WALK)
+    node.until_shown(CORNER_PLACES)
+    places = {(each.pose.position.x, each.pose.position.y) for each in paths[-1].poses}
+    assert places == CORNER_PLACES
+    assert node.call("reset").success
+    node.peer.until(served, "the saved waypoints again")
+
+
 # What it is sent
 
 
@@ -617,6 +645,7 @@ def test_parameters_can_be_set_and_bad_values_are_refused_with_a_reason(
         "queue_depth": (1, "read-only"),
         "waiting_limit": (1, "read-only"),
         "episode_gap": (1.0, "read-only"),
+        "waypoints_file": ("elsewhere", "read-only"),
         "result_folder": ("elsewhere", "read-only"),
     }
     results = node.set(**{name: value for name, (value, _) in refused.items()})
@@ -655,6 +684,19 @@ def test_bad_parameters_at_the_start_are_one_sentence(
     assert end.status == 1
     assert end.err.startswith(f"subgoal_node: {sentence}")
     assert end.err.count("\n") == 1
+
+
+def test_bad_waypoints_at_the_start_are_one_sentence(start: StartNode, tmp_path: Path) -> None:
+    (tmp_path / "map.yaml").write_text("image: map.pgm\n")
+    for name, words in (
+        ("none.yaml", "the file cannot be read (No such file or directory); check the path"),
+        ("map.yaml", "has no waypoints under the key 'waypoints'; save it with"),
+    ):
+        path = tmp_path / name
+        end = start("subgoal_node", *as_arguments({"waypoints_file": path})).end()
+        assert end.status == 1
+        assert end.err.startswith(f"subgoal_node: {path}: {words}")
+        assert end.err.count("\n") == 1
 
 
 # Replaying

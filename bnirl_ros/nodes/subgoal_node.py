@@ -35,7 +35,8 @@ from bnirl_ros.views.markers import assignment_markers, subgoal_markers
 from bnirl_ros.views.messages import MarkerArray, Message, OccupancyGrid
 from bnirl_ros.views.messages import Path as PathMessage
 from bnirl_ros.views.results import write_results
-from bnirl_ros.views.waypoints import waypoint_path
+from bnirl_ros.views.waypoint_files import read_waypoints
+from bnirl_ros.views.waypoints import Waypoints, path_of, waypoint_path
 
 PARAMETERS = (
     NodeParameter(
@@ -57,6 +58,11 @@ PARAMETERS = (
         "features",
         "",
         Limits("file with features of the map's cells, for feature subgoals; empty: none"),
+    ),
+    NodeParameter(
+        "waypoints_file",
+        "",
+        Limits("waypoints.yaml to publish until there is a posterior; empty: none"),
     ),
     NodeParameter(
         "result_folder",
@@ -93,7 +99,8 @@ class SubgoalNode(Node):
         """Declare everything, and begin to listen.
 
         Raises:
-            InputError: a parameter was given a value that it cannot have.
+            InputError: a parameter was given a value that it cannot have, or names a file that
+                cannot be used.
         """
         super().__init__("subgoal_node")
         own = declare(self, PARAMETERS)
@@ -102,6 +109,9 @@ class SubgoalNode(Node):
         self._features: FeatureLayer | None = None
         if own["features"]:
             self._features = load_features(Path(own["features"]).expanduser())
+        self._saved_waypoints: Waypoints | None = None
+        if own["waypoints_file"]:
+            self._saved_waypoints = read_waypoints(Path(own["waypoints_file"]).expanduser())
         self._recorder = Recorder(own["waiting_limit"])
         self._inference = BackgroundInference(self._recorder, settings, own["episode_gap"])
         self._faults: Counter[str] = Counter()
@@ -128,6 +138,7 @@ class SubgoalNode(Node):
             name: self.create_publisher(message_class(type_name), name, _LATCHED)
             for name, type_name in OUTPUTS.items()
         }
+        self._send_saved_waypoints()
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         # In a group of its own: in the node's, everything else would wait until it is answered.
         answered_later = ReentrantCallbackGroup()
@@ -251,13 +262,22 @@ class SubgoalNode(Node):
         self._result = result
         now = self.get_clock().now().nanoseconds
         self._send("subgoals", subgoal_markers, result, now)
-        self._send("waypoints", waypoint_path, result, now)
+        if result.summary or not self._saved_waypoints:
+            self._send("waypoints", waypoint_path, result, now)
+        else:
+            self._send_saved_waypoints()
         self._send("subgoal_belief", belief_grid, result, now)
         self._assignments_due = True
 
     def _send(self, name: str, view: View, result: Result, stamp: int) -> None:
         summary = result.summary or nothing_found(result.grid_map)
         self._outputs[name].publish(to_ros(view(summary, result.grid_map, stamp)))
+
+    def _send_saved_waypoints(self) -> None:
+        """Publish the waypoints of a file, if one was given: they stand in for a posterior."""
+        if self._saved_waypoints:
+            path = path_of(self._saved_waypoints, self.get_clock().now().nanoseconds)
+            self._outputs["waypoints"].publish(to_ros(path))
 
     def _publish_diagnostics(self) -> None:
         self._look()  # whoever reads "settled" has the last result
