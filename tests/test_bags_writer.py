@@ -226,7 +226,7 @@ def test_no_message_goes_where_it_does_not_belong(tmp_path: File) -> None:
         with pytest.raises(ValueError, match="no name for a topic"):
             writer.add_topic("a topic", PoseStamped.TYPE, RELIABLE)
         with pytest.raises(InputError, match="unknown to bnirl_ros"):
-            writer.add_topic("odom", "nav_msgs/msg/Odometry", RELIABLE)
+            writer.add_topic("scan", "sensor_msgs/msg/LaserScan", RELIABLE)
         with pytest.raises(ValueError, match="carries geometry_msgs/msg/PoseStamped"):
             writer.write("pose", Vector3Stamped(), 0)
         with pytest.raises(ValueError, match="no time that a bag can hold"):
