@@ -11,16 +11,19 @@ import pytest
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.errors import InputError
 from bnirl_ros.experiments.scenarios import outcome_of
+from bnirl_ros.inference import filtering
 from bnirl_ros.inference.filtering import (
     SubgoalFilter,
     filtered,
     foreseen,
+    middle_of_draws,
     weights_of_draws,
 )
 from bnirl_ros.inference.posterior import Posterior, grid_world, infer, pursuit_model_of
 from bnirl_ros.inference.prediction import log_predictive
 from bnirl_ros.inference.settings import Settings
-from bnirl_ros.maps import parse_text_grid
+from bnirl_ros.maps import GridMap, parse_text_grid
+from bnirl_ros.mdp.actions import ACTION_NAMES
 from bnirl_ros.mdp.goal_values import goal_values
 from bnirl_ros.model.likelihood import action_log_likelihood
 from bnirl_ros.model.pursuits import PRIORS, PursuitModel
@@ -216,6 +219,59 @@ def test_observing_step_by_step_is_filtering_the_whole() -> None:
         np.testing.assert_allclose(now, belief[row], rtol=1e-9, atol=1e-15)
 
 
+def expected_and_watched(
+    posterior: Posterior, grid_map: GridMap, watched: Demonstration
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Belief before each action and after it, by a model of all that is watched."""
+    weights, parameters = middle_of_draws(posterior)
+    model = pursuit_model_of(watched, posterior.candidates, grid_map, posterior.settings)
+    return foreseen(model, weights, parameters), filtered(model, weights, parameters)[0]
+
+
+@pytest.mark.parametrize(
+    "settings", [{}, {"arrival_radius": 1.0}, {"likelihood": "value"}], ids=str
+)
+def test_what_is_expected_in_a_cell_is_what_observing_there_begins_with(
+    settings: dict[str, object],
+) -> None:
+    posterior = posterior_with(**ONE_DRAW, **settings)
+    watched, _ = walked(seed=2, episodes=2)
+    before, after = expected_and_watched(posterior, MAP, watched)
+    watching = SubgoalFilter(posterior, MAP)
+    for row, starts in enumerate(watched.starts):
+        if starts:
+            watching.begin_episode()
+        expected = watching.expect(watched.cells[row])
+        np.testing.assert_allclose(expected, before[row], rtol=1e-9, atol=1e-15)
+        now = watching.observe(watched.cells[row], int(watched.action[row]))
+        np.testing.assert_allclose(now, after[row], rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("room", [None, 0, 500])
+def test_cells_that_the_posterior_never_saw_are_watched_too(
+    room: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if room is not None:  # costs for all other cells at once, for one after the other, for some
+        monkeypatch.setattr(filtering, "_ROOM", room)
+    edge = Demonstration(
+        np.zeros(12, dtype=np.int64),
+        np.array([(x, 0) for x in range(6)] * 2),
+        np.full(12, ACTION_NAMES.index("E")),
+        *WITHOUT_LAST_POSES,
+    )
+    posterior = infer(edge, MAP, Settings(**ONE_DRAW))
+    watched = episode(walked(seed=3)[0], 0)
+    assert not {*map(tuple, watched.cells.tolist())} <= {*map(tuple, edge.cells.tolist())}
+    before, after = expected_and_watched(posterior, MAP, watched)
+    watching = SubgoalFilter(posterior, MAP)
+    half = len(watched) // 2
+    first = watching.observe_all(watched.cells[:half], watched.action[:half])
+    expected = watching.expect(watched.cells[half])
+    second = watching.observe_all(watched.cells[half:], watched.action[half:])
+    np.testing.assert_allclose(np.concatenate([first, second]), after, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(expected, before[half], rtol=1e-9, atol=1e-15)
+
+
 def test_a_new_episode_forgets_the_one_before() -> None:
     watching = SubgoalFilter(posterior_with(**ONE_DRAW), MAP)
     fresh = watching.observe((3, 1), 2)
@@ -302,6 +358,8 @@ def test_a_cell_that_cannot_be_watched_is_refused_and_changes_nothing() -> None:
     for cell in ((3, 1), (4, 1), (5, 1), (-1, 1), (0, -1), (0, 3)):
         with pytest.raises(InputError, match=r"cell .* no candidate can be reached from it"):
             watching.observe(cell, 1)
+        with pytest.raises(InputError, match=r"cell .* no candidate can be reached from it"):
+            watching.expect(cell)
     np.testing.assert_array_equal(watching.observe((1, 0), 1), other.observe((1, 0), 1))
 
 

@@ -160,7 +160,7 @@ def test_the_sequential_predictive_is_the_textbooks(likelihood: str) -> None:
     world = grid_world(MAP, posterior.settings)
     same = world.same_action(world.states_of(watched.cells))
     told = predict(posterior, watched, MAP)
-    (weights,), (parameters,) = evenly_spaced_draws(posterior, MAP)
+    (weights,), (parameters,) = evenly_spaced_draws(posterior)
     for t in (0, 1, 5, len(watched) - 1):
         for column, action in enumerate(world.actions):
             trial = with_action(watched, t, int(action))
@@ -200,7 +200,7 @@ def test_the_likeliest_subgoal_so_far_gives_the_action() -> None:
     posterior = posterior_with(**ONE_DRAW)
     watched = walked(seed=1, episodes=2)[0]
     told = predict_from_mode(posterior, watched, MAP)
-    (weights,), (parameters,) = evenly_spaced_draws(posterior, MAP)
+    (weights,), (parameters,) = evenly_spaced_draws(posterior)
     model = pursuit_model_of(watched, posterior.candidates, MAP, posterior.settings)
     before = textbook_filter(model, weights, parameters)[2]
     np.testing.assert_array_equal(told.subgoal, before.argmax(axis=1))

@@ -12,9 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.errors import InputError
-from bnirl_ros.inference.posterior import Posterior, grid_world, pursuit_model_of
+from bnirl_ros.inference.posterior import Posterior, grid_world
 from bnirl_ros.inference.pursuit_gibbs import (
     forward_pass,
     kernel_model,
@@ -23,9 +22,19 @@ from bnirl_ros.inference.pursuit_gibbs import (
 )
 from bnirl_ros.inference.runs import run_counts
 from bnirl_ros.maps.grid_map import GridMap
-from bnirl_ros.model.pursuits import ALPHA, ETA, PRIORS, PursuitModel
+from bnirl_ros.mdp.grid_world import GridWorld
+from bnirl_ros.model.pursuits import (
+    ALPHA,
+    ETA,
+    PRIORS,
+    PursuitModel,
+    action_costs,
+    pursuit_model,
+    switch_probabilities,
+)
 
 _DRAWS = 64  # of the posterior, over which a prediction is averaged
+_ROOM = 1 << 22  # costs of actions that are kept beside the posterior's: 32 MB
 
 
 def filtered(
@@ -141,7 +150,7 @@ def _urn_weights(
 
 
 def evenly_spaced_draws(
-    posterior: Posterior, grid_map: GridMap
+    posterior: Posterior,
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Of evenly spaced draws of all chains, the weights of the next subgoal and the parameters.
 
@@ -149,38 +158,70 @@ def evenly_spaced_draws(
         (D, G) weights as in `weights_of_draws`, and (D, P) parameters in the order of `PRIORS`.
 
     Raises:
-        InputError: the posterior is not one of the sequential model, or no candidate can be
-            reached from an observation.
+        InputError: the posterior is not one of the sequential model.
     """
-    if posterior.settings.model != "sequential":
+    model = posterior.model
+    if not isinstance(model, PursuitModel):
         raise InputError("only the sequential model can be filtered; infer with it")
-    model = pursuit_model_of(
-        posterior.demonstration, posterior.candidates, grid_map, posterior.settings
-    )
     numbers = np.unique(np.linspace(0, posterior.draws.log_joint.size - 1, _DRAWS).astype(int))
     parameters = posterior.draws.parameters.reshape(-1, len(PRIORS))[numbers]
     return weights_of_draws(posterior, model, numbers), parameters
 
 
 def middle_of_draws(
-    posterior: Posterior, grid_map: GridMap
+    posterior: Posterior,
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """(G,) mean weights of the next subgoal, and (P,) median parameters.
 
     Raises:
         InputError: the posterior is not one of the sequential model.
     """
-    weights, _ = evenly_spaced_draws(posterior, grid_map)
+    weights, _ = evenly_spaced_draws(posterior)
     parameters = np.median(posterior.draws.parameters.reshape(-1, len(PRIORS)), axis=0)
     return weights.mean(axis=0), parameters
+
+
+class _ActionCosts:
+    """What actions cost in any state: as the posterior has it, and elsewhere found when asked for.
+
+    To find it takes as long for many states as for one, so it is found for as many of those around
+    as there is room for.
+    """
+
+    def __init__(self, posterior: Posterior, world: GridWorld) -> None:
+        assert isinstance(posterior.model, PursuitModel)
+        self._goals, self._world = posterior.candidates.goals, world
+        self._likelihood = posterior.settings.likelihood
+        visited = np.unique(world.states_of(posterior.demonstration.cells))
+        self._known = dict(zip(visited.tolist(), posterior.model.cost, strict=True))
+        self._found: dict[int, npt.NDArray[np.float64]] = {}
+
+    def of(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+        """(U, A, G) the costs in each of the states, in which candidates can be reached."""
+        asked = states.tolist()
+        further = [state for state in asked if state not in self._known]
+        if not self._found.keys() >= set(further):
+            found = self._around(np.array(further))
+            costs = action_costs(self._world, found, self._goals, self._likelihood)
+            self._found = dict(zip(found.tolist(), costs, strict=True))
+        return np.stack([self._known.get(state, self._found.get(state)) for state in asked])
+
+    def _around(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """These states, and those nearest to the last of them that the posterior lacks."""
+        free = np.flatnonzero(self._world.free)
+        others = np.setdiff1d(free, [*self._known, *states])
+        cells, last = self._world.cells_of(others), self._world.cells_of(states[-1:])
+        nearest = np.argsort(np.abs(cells - last).max(axis=1), kind="stable")
+        room = _ROOM // (len(self._world.actions) * len(self._goals))
+        return np.concatenate([states, others[nearest[: max(0, room - len(states))]]])
 
 
 class SubgoalFilter:
     """Watches a demonstrator and tells, action by action, what it is going for now.
 
-    With the posterior medians of the parameters, and the mean of the weights over some draws.
-    Holds the action likelihoods of all free cells: their number times that of actions times that
-    of candidates.
+    With the posterior medians of the parameters, and the mean of the weights over some draws. An
+    action costs as many operations as there are candidates; in a cell where the demonstrator of
+    the posterior never acted, now and then the goal values of all candidates have to be solved.
     """
 
     def __init__(self, posterior: Posterior, grid_map: GridMap) -> None:
@@ -189,28 +230,18 @@ class SubgoalFilter:
         Raises:
             InputError: the posterior is not one of the sequential model.
         """
-        self._weights, self._parameters = middle_of_draws(posterior, grid_map)
+        self._weights, self._parameters = middle_of_draws(posterior)
         self.candidates = posterior.candidates
+        self._settings = posterior.settings
         self._world = grid_world(grid_map, posterior.settings)
-        free = np.flatnonzero(self._world.free)
-        states = free[self.candidates.reachable_from(self._world, free)]
-        actions = self._world.actions
-        every = Demonstration(
-            episode=np.zeros(len(states) * len(actions), dtype=np.int64),
-            cells=self._world.cells_of(np.repeat(states, len(actions))),
-            action=np.tile(actions, len(states)),
-            last_episode=np.empty(0, dtype=np.int64),
-            last_cells=np.empty((0, 2), dtype=np.int64),
+        self._radius = posterior.settings.arrival_radius / grid_map.resolution
+        self._costs = _ActionCosts(posterior, self._world)
+        self._parts = self._world.parts_of(
+            self.candidates.goals.states[self.candidates.goals.first[:-1]]
         )
-        self._model = pursuit_model_of(every, self.candidates, grid_map, posterior.settings)
-        self._kernel = kernel_model(self._model)
-        self._chosen = softmax_table(self._kernel, self._parameters[ALPHA])
-        # By cell: the number of a state tells nothing of a cell beyond the map's edge.
-        self._row_of_cell = {
-            (int(x), int(y)): row for row, (x, y) in enumerate(self._world.cells_of(states))
-        }
         self._belief: npt.NDArray[np.float64] | None = None
-        self._row = 0
+        self._drawn = self._weights  # those of the episode's part of the map
+        self._state = 0
 
     def begin_episode(self) -> None:
         """The next action is the first one of an episode."""
@@ -225,34 +256,94 @@ class SubgoalFilter:
 
         Raises:
             InputError: the cell is not free, or no candidate can be reached from it, or there is
-                no such action.
+                no such action. Nothing is changed then.
         """
-        x, y = (int(coordinate) for coordinate in np.asarray(cell).reshape(2))
-        row = self._row_of_cell.get((x, y))
-        if row is None:
-            raise InputError(f"cell ({x}, {y}): no candidate can be reached from it")
-        actions = self._world.actions
-        if action not in actions:
-            raise InputError(f"action {action}: is none of {', '.join(map(str, actions))}")
-        pair = self._kernel.pair_of[row * len(actions) + np.searchsorted(actions, action)]
-        starts = self._belief is None
-        here = self._model.candidate_part == self._model.state_part[row]
-        weights = np.where(here, self._weights, 0.0)
-        after = np.empty((1, len(weights)))
-        forward_pass(
-            self._kernel._replace(
-                state_of=np.array([self._row, row]),
-                pair_of=np.array([0, pair]),
-                starts=np.array([False, starts]),
-            ),
-            self._parameters,
-            self._chosen,
-            weights,
-            1,
-            2,
-            weights if self._belief is None else self._belief,
-            after,
-            np.empty(1),
+        return self.observe_all(np.asarray(cell).reshape(1, 2), [action])[0]
+
+    def observe_all(self, cells: npt.ArrayLike, actions: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """P(subgoal at t | actions of this episode up to t) (N, G), of the next N of them.
+
+        Args:
+            cells: (N, 2) in which each action was chosen; one at least.
+            actions: (N,) indices into `ACTION_NAMES`.
+
+        Raises:
+            InputError: as in `observe`, of any of them.
+        """
+        states, chosen = self._states_of(cells), np.asarray(actions)
+        drawn, before, first = self._drawn, self._belief, 0
+        if before is None:
+            before = drawn = self._weights_from(states[0])  # as `before` not read
+        else:  # the state before tells whether the demonstrator has arrived or stayed
+            states, chosen, first = np.append(self._state, states), np.append(0, chosen), 1
+        starts = np.arange(len(states)) == 0
+        visited = np.unique(states)
+        model = pursuit_model(
+            self._world,
+            states,
+            chosen,
+            starts,
+            self.candidates.goals,
+            arrived=self._reached_in(visited),
+            likelihood=self._settings.likelihood,
+            fixed=self._settings.fixed,
+            cost=self._costs.of(visited),
         )
-        self._belief, self._row = after[0], row
-        return self._belief.copy()
+        kernel = kernel_model(model)
+        belief = np.empty((len(states) - first, len(drawn)))
+        forward_pass(
+            kernel,
+            self._parameters,
+            softmax_table(kernel, self._parameters[ALPHA]),
+            drawn,
+            first,
+            len(states),
+            before,
+            belief,
+            np.empty(len(belief)),
+        )
+        self._belief, self._drawn, self._state = belief[-1].copy(), drawn, int(states[-1])
+        return belief
+
+    def expect(self, cell: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """P(subgoal of the next action | actions of this episode so far) (G,), chosen in a cell.
+
+        Who has arrived there may have moved on to the next subgoal: what `observe` begins with.
+
+        Args:
+            cell: (x, y) in which the next action will be chosen.
+
+        Raises:
+            InputError: the cell is not free, or no candidate can be reached from it.
+        """
+        (state,) = self._states_of(cell)
+        if self._belief is None:
+            return self._weights_from(state)
+        there_already, here = self._reached_in(np.array([self._state, state]))
+        rho = switch_probabilities(here, there_already, self._parameters)
+        switched = rho * self._belief
+        return self._belief - switched + switched.sum() * self._drawn
+
+    def _states_of(self, cells: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """(N,) state numbers of cells (N, 2) from which a candidate can be reached."""
+        places = np.asarray(cells, dtype=np.int64).reshape(-1, 2)
+        height, width = self._world.free.shape
+        # The number of a state tells nothing of a cell beyond the map's edge.
+        known = ((places >= 0) & (places < (width, height))).all(axis=1)
+        states = self._world.states_of(places[known])
+        known[known] = self._world.free.reshape(-1)[states] & np.isin(
+            self._world.parts_of(states), self._parts
+        )
+        for x, y in places[~known][:1].tolist():
+            raise InputError(f"cell ({x}, {y}): no candidate can be reached from it")
+        return states
+
+    def _weights_from(self, state: int) -> npt.NDArray[np.float64]:
+        """(G,) the weights in the part of the map in which a state lies; 0 elsewhere."""
+        (part,) = self._world.parts_of(np.array([state]))
+        return np.where(self._parts == part, self._weights, 0.0)
+
+    def _reached_in(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+        """(U, G) whether who is in each state counts as being at each candidate."""
+        cells = self._world.cells_of(states)
+        return self.candidates.reached_in(self._world, cells, self._radius)

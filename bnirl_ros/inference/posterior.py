@@ -35,6 +35,7 @@ class Posterior:
         draws: draws (chain, draw, N).
         mode: the most probable partition with its subgoals.
         settings: with which they were drawn.
+        model: of the demonstration, over the candidates.
         rhat, ess: the worst one for log joint, number of partitions and inferred parameters, all
             free of labels; None where undefined (`bnirl_ros.inference.diagnostics`).
     """
@@ -44,6 +45,7 @@ class Posterior:
     draws: Draws
     mode: Mode
     settings: Settings
+    model: Model
     rhat: float | None
     ess: float | None
 
@@ -167,6 +169,7 @@ def posterior_of(
         draws=draws,
         mode=mode_of(model, draws),
         settings=settings,
+        model=model,
         rhat=max(rhats, default=None),
         ess=min(sizes, default=None),
     )

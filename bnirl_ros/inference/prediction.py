@@ -116,7 +116,7 @@ def predict_from_mode(
     _check(demonstration, grid_map, world)
     count, candidates = len(demonstration), len(posterior.candidates)
     if posterior.settings.model == "sequential":
-        weights, parameters = middle_of_draws(posterior, grid_map)
+        weights, parameters = middle_of_draws(posterior)
         model = _watched(posterior, demonstration, grid_map)
         subgoals = foreseen(model, weights, parameters)
         subgoal, likeliest = subgoals.argmax(axis=1), subgoals.max(axis=1)
@@ -238,7 +238,7 @@ def _in_sequence(
 
     (N, A) the probability of each action that differs to the model, and (N, G) of each subgoal.
     """
-    draws = evenly_spaced_draws(posterior, grid_map)
+    draws = evenly_spaced_draws(posterior)
     model = _watched(posterior, demonstration, grid_map)
     probability = np.zeros((len(demonstration), model.cost.shape[1]))
     subgoals = np.zeros((len(demonstration), len(posterior.candidates)))

@@ -140,12 +140,10 @@ class PursuitModel:
             subgoal_of: (N,) candidate index theta of each observation's subgoal.
             parameters: in the order of `PRIORS`.
         """
-        on_arrival, at_subgoal, elsewhere = parameters[[ON_ARRIVAL, AT_SUBGOAL, ELSEWHERE]]
         before = np.roll(subgoal_of, 1)
         here = self.arrived[self.state_of, before]
         there_already = self.arrived[np.roll(self.state_of, 1), before]
-        rho = np.where(here, np.where(there_already, at_subgoal, on_arrival), elsewhere)
-        return np.where(self.starts, 1.0, rho)
+        return np.where(self.starts, 1.0, switch_probabilities(here, there_already, parameters))
 
     def log_joint(
         self,
@@ -174,6 +172,22 @@ class PursuitModel:
         return float(total)
 
 
+def switch_probabilities(
+    here: npt.NDArray[np.bool_],
+    there_already: npt.NDArray[np.bool_],
+    parameters: npt.NDArray[np.float64],
+) -> npt.NDArray[np.float64]:
+    """Rho, element by element.
+
+    Args:
+        here: whether the demonstrator is at its subgoal where the next action is chosen.
+        there_already: whether it was where the last action was chosen.
+        parameters: in the order of `PRIORS`.
+    """
+    on_arrival, at_subgoal, elsewhere = parameters[[ON_ARRIVAL, AT_SUBGOAL, ELSEWHERE]]
+    return np.where(here, np.where(there_already, at_subgoal, on_arrival), elsewhere)
+
+
 def _log_urn(counts: npt.NDArray[np.int64], weights: npt.NDArray[np.float64]) -> float:
     """Log probability of a sequence of draws from a Polya urn, whatever their order."""
     drawn = counts > 0
@@ -193,6 +207,7 @@ def pursuit_model(
     arrived: npt.NDArray[np.bool_] | None = None,
     likelihood: str = "delay",
     fixed: Mapping[str, float] | None = None,
+    cost: npt.NDArray[np.float64] | None = None,
 ) -> PursuitModel:
     """The sequential model of a demonstration.
 
@@ -207,6 +222,8 @@ def pursuit_model(
         likelihood: "delay": actions cost steps, those that do the same are one action; "value":
             they cost value, equation (7) to the letter.
         fixed: values of parameters in `PRIORS` that are not to be inferred.
+        cost: (U, A, G) `action_costs` in each distinct state, in ascending order, where they are
+            known; by default they are found, which takes most of the time.
 
     Raises:
         InputError: an observation lies where no candidate can be reached, or there is no such
@@ -225,18 +242,13 @@ def pursuit_model(
         raise ValueError("a candidate lies in more than one part of the map")
     if not np.isin(state_part, candidate_part).all():
         raise InputError("an observation lies where no candidate can be reached")
-    values = goal_values(mdp, goals, visited, _VALUE_TOLERANCE)
     priors = dict(PRIORS)
     if likelihood == "delay":
-        same = mdp.same_action(visited)
-        action_of = same[state_of, action_of]
-        redundant = same != np.arange(same.shape[1])
-        cost = np.where(redundant[:, :, None], np.inf, delays(values, mdp.discount))
+        action_of = mdp.same_action(visited)[state_of, action_of]
     else:
-        cost = value_losses(values)
         priors["alpha"] = VALUE_ALPHA
     return PursuitModel(
-        cost=cost,
+        cost=action_costs(mdp, visited, goals, likelihood) if cost is None else cost,
         state_of=state_of.astype(np.int64),
         action_of=action_of.astype(np.int64),
         starts=np.asarray(starts, dtype=np.bool_),
@@ -247,6 +259,25 @@ def pursuit_model(
         fixed=dict(fixed or {}),
         priors=priors,
     )
+
+
+def action_costs(
+    mdp: MarkovDecisionProcess, states: npt.NDArray[np.int64], goals: Goals, likelihood: str
+) -> npt.NDArray[np.float64]:
+    """(U, A, G) what each action costs in each of the states (U,), as in `PursuitModel.cost`.
+
+    Args:
+        mdp: where they are.
+        states: state numbers.
+        goals: the candidates.
+        likelihood: as in `pursuit_model`.
+    """
+    values = goal_values(mdp, goals, states, _VALUE_TOLERANCE)
+    if likelihood != "delay":
+        return value_losses(values)
+    same = mdp.same_action(states)
+    redundant = same != np.arange(same.shape[1])
+    return np.where(redundant[:, :, None], np.inf, delays(values, mdp.discount))
 
 
 def _middles(mdp: MarkovDecisionProcess, goals: Goals) -> npt.NDArray[np.int64]:
