@@ -25,12 +25,14 @@ class Placement:
         demonstration: its N observations.
         poses: (N,) index into the recording's poses of each observation: as a recording only
             grows, that tells which observations are the same in a later placement.
+        last_poses: (L,) the same of each last pose without an action.
         messages: number of poses and actions that the recording had.
         faults: what did not fit, counted by fault.
     """
 
     demonstration: Demonstration
     poses: npt.NDArray[np.int64]
+    last_poses: npt.NDArray[np.int64]
     messages: int
     faults: Counter[str]
 
@@ -96,6 +98,7 @@ def place(
     return Placement(
         demonstration=demonstration,
         poses=np.flatnonzero(in_frame)[observed],
+        last_poses=np.flatnonzero(in_frame)[kept],
         messages=len(recording.pose_stamps) + len(recording.actions),
         faults=faults,
     )

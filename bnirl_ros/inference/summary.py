@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Any
 
@@ -107,6 +107,8 @@ class Summary:
             to its end; 0 where they are no loop.
         unexplained: expected share of observations that no subgoal explains.
         parameters: of the model, inferred or fixed.
+        rank_of_candidate: (G,) int64: rank of the subgoal that each candidate counts as, be it
+            that it lies within the arrival radius of it; 0 for one that is no subgoal of the mode.
     """
 
     subgoals: tuple[Subgoal, ...]
@@ -122,6 +124,9 @@ class Summary:
     repetitions: int = 0
     unexplained: float = 0.0
     parameters: tuple[Parameter, ...] = ()
+    rank_of_candidate: npt.NDArray[np.int64] = field(
+        default_factory=lambda: np.empty(0, dtype=np.int64)
+    )
 
 
 def summarise(posterior: Posterior, grid_map: GridMap) -> Summary:
@@ -139,6 +144,7 @@ def summarise(posterior: Posterior, grid_map: GridMap) -> Summary:
     cell_probability[all_cells[:, 1], all_cells[:, 0]] = (counts > 0).mean(axis=0)[goal_of]
 
     subgoal_of = posterior.mode.subgoal_of
+    region_of = np.arange(len(posterior.candidates), dtype=np.int32)
     if in_sequence and settings.arrival_radius > 0.0:
         region_of = _regions(posterior, counts, settings.arrival_radius / grid_map.resolution)
         counts = posterior.pursuit_counts(region_of)
@@ -154,6 +160,8 @@ def summarise(posterior: Posterior, grid_map: GridMap) -> Summary:
     rank_of[explained] = (np.argsort(by_rank) + 1)[index]
     ranked = candidates[by_rank]
     found = posterior.candidates.take(ranked)
+    rank_of_region = np.zeros(len(posterior.candidates), dtype=np.int64)
+    rank_of_region[ranked] = np.arange(len(ranked)) + 1
     sequence = _pursuits(demonstration, rank_of, _at_subgoal(posterior, grid_map, found))
     visits = _visits(sequence) if in_sequence else episode_visits(demonstration, found, rank_of)
     places = np.array(
@@ -197,6 +205,7 @@ def summarise(posterior: Posterior, grid_map: GridMap) -> Summary:
         repetitions=_repetitions(visits) if in_sequence else 0,
         unexplained=float((posterior.draws.subgoal_of < 0).mean()),
         parameters=_parameters(posterior) if in_sequence else (),
+        rank_of_candidate=rank_of_region[region_of],
     )
 
 
