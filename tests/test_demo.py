@@ -47,6 +47,7 @@ def test_demo_tells_shows_and_records_what_it_found(tmp_path: Path) -> None:
     counts = {topic.name: topic.messages for topic in bag.topics()}
     assert min(counts.values()) > 0
     assert {"/map", "/subgoals", "/assignments", "/waypoints", "/subgoal_belief"} < set(counts)
+    assert {"/current_subgoal", "/intent"} < set(counts)
     assert counts["/action"] == len(read_demonstration(LOOP, {}).recording.actions)
     assert sum(1 for _ in bag.messages()) == sum(counts.values())
     assert bag.damage is None

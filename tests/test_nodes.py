@@ -410,9 +410,59 @@ def test_assignments_come_at_most_once_a_second(subgoals: Callable[..., Subgoals
     assert len(node.outputs["subgoals"]) > len(stamps)
 
 
-def test_who_comes_late_gets_all_four_outputs(
-    subgoals: Callable[..., Subgoals], peer: Peer
-) -> None:
+def test_the_next_corner_is_named_on_the_way_there(subgoals: Callable[..., Subgoals]) -> None:
+    node = subgoals(**QUICK)
+    node.send([map_of_grid()], walk(rounds=3))
+    node.until_settled(3 * OBSERVATIONS_OF_WALK)
+    node.until_shown(CORNER_PLACES)
+    current, arrays = node.outputs["current_subgoal"], node.outputs["intent"]
+    node.peer.until(lambda: current and arrays, "what was pursued last")
+    marker = message_class("visualization_msgs/msg/Marker")
+
+    def is_told(place: tuple[float, float], stamp: int) -> bool:
+        position = current[-1].pose.position
+        told = [stamp_of(current[-1]), stamp_of(arrays[-1].markers[0])]
+        return (position.x, position.y) == place and told == [stamp, stamp]
+
+    fourth = walk(start=START + 1000 * SECOND)
+    to_corner = 12  # poses and actions on the way to each
+    for side, corner in enumerate(CORNERS[1:3]):
+        under_way = side * to_corner + 8  # two steps before it
+        node.send(fourth[side * to_corner : under_way])
+        (place,), stamp = centres([corner]), fourth[under_way - 1][2]
+        node.peer.until(partial(is_told, place, stamp), f"{corner}")
+        first, *rest = arrays[-1].markers
+        assert (first.action, first.header.frame_id) == (marker.DELETEALL, "map")
+        assert len({(each.ns, each.id) for each in rest}) == len(rest)
+        arrows = {each.id: each for each in rest if each.ns == "intent"}
+        likeliest = max(arrows.values(), key=lambda each: each.color.a)
+        assert likeliest.type == marker.ARROW
+        assert likeliest.color.a > 0.5
+        here = fourth[under_way - 2][1].pose.position
+        assert [(each.x, each.y) for each in likeliest.points] == [(here.x, here.y), place]
+        node.send(fourth[under_way : (side + 1) * to_corner])
+
+    # What is forgotten is not shown any more.
+    assert node.call("reset").success
+    node.peer.until(lambda: len(arrays[-1].markers) == 1, "DELETEALL only")
+
+
+def test_the_papers_model_tells_no_intent(subgoals: Callable[..., Subgoals]) -> None:
+    node = subgoals(**QUICK, model="paper")
+    node.send([map_of_grid()], walk())
+    node.until_settled(OBSERVATIONS_OF_WALK)
+    node.until_shown(CORNER_PLACES)
+    assert not node.outputs["current_subgoal"]
+    assert not node.outputs["intent"]
+    # Another model, and back: what it told is taken away.
+    assert all(each.successful for each in node.set(model="sequential"))
+    node.peer.until(lambda: node.outputs["intent"], "an intent")
+    assert len(node.outputs["intent"][-1].markers) > 1
+    assert all(each.successful for each in node.set(model="paper"))
+    node.peer.until(lambda: len(node.outputs["intent"][-1].markers) == 1, "DELETEALL only")
+
+
+def test_who_comes_late_gets_all_outputs(subgoals: Callable[..., Subgoals], peer: Peer) -> None:
     node = subgoals(**QUICK)
     node.send([map_of_grid()], walk())
     node.until_settled(OBSERVATIONS_OF_WALK)

@@ -15,6 +15,7 @@ import pytest
 from matplotlib.text import Text
 from PIL import Image
 
+from bnirl_ros.inference.intent import Intent
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.inference.summary import Parameter, Pursuit, Subgoal, Summary, nothing_found
 from bnirl_ros.maps import GridMap, map_from_occupancy, yaw_of
@@ -22,6 +23,7 @@ from bnirl_ros.mdp.actions import ACTION_NAMES
 from bnirl_ros.views.belief import belief_grid, map_message
 from bnirl_ros.views.colours import UNEXPLAINED, colour_of
 from bnirl_ros.views.demonstration import action_message, pose_message
+from bnirl_ros.views.intent import current_subgoal, intent_markers, no_intent
 from bnirl_ros.views.markers import assignment_markers, subgoal_markers
 from bnirl_ros.views.messages import Marker, MarkerArray, Pose
 from bnirl_ros.views.plot import draw_summary
@@ -282,6 +284,64 @@ def test_waypoints_are_the_subgoals_in_the_order_visited(summary, grid_map):
     yaws = [yaw_in(pose.pose) for pose in path.poses]
     assert yaws == pytest.approx([YAW + math.atan2(2, 4), 0.0, 0.0])
     assert all(pose.header == path.header for pose in path.poses)
+
+
+@pytest.fixture
+def intent(summary, grid_map) -> Intent:
+    """Of a demonstrator who is at subgoal 2 and most probably goes for 3."""
+    return Intent(grid_map, summary, np.array([0.004, 0.25, 0.6]), cell=(0, 0), pose=7)
+
+
+def test_the_current_subgoal_is_the_most_probable_one_with_its_waypoints_heading(intent, summary):
+    told = current_subgoal(intent, STAMP)
+    assert (told.header.frame_id, told.header.stamp.sec) == ("odom", 12)
+    waypoint = waypoint_path(summary, intent.grid_map, STAMP).poses[-1]
+    assert told == waypoint
+    nothing = dataclasses.replace(
+        intent, summary=all_unexplained(summary), probability=np.empty(0)
+    )
+    assert current_subgoal(nothing, STAMP) is None
+    assert [marker.text for marker in intent_markers(nothing, STAMP).markers[1:]] == [
+        "another 1.00"
+    ]
+
+
+def test_the_intent_is_arrows_as_opaque_as_it_is_probable(intent, summary, grid_map):
+    first, *others = intent_markers(intent, STAMP).markers
+    assert (first.action, first.ns, first.header.frame_id) == (Marker.DELETEALL, "", "odom")
+    by_key = {(marker.ns, marker.id): marker for marker in others}
+    # Subgoal 1 is too improbable to be shown, and an arrow to where one is has no direction.
+    assert list(by_key) == [
+        ("intent_label", 0),
+        ("intent_label", 2),
+        ("intent", 3),
+        ("intent_label", 3),
+    ]
+    assert len(by_key) == len(others)
+    assert all(marker.header.stamp.nanosec == 345_678_901 for marker in others)
+    assert all(math.isfinite(number) for marker in others for number in numbers(marker))
+    arrow = by_key["intent", 3]
+    start, end = grid_map.centres_of([intent.cell])[0], summary.subgoals[2].position
+    assert [(point.x, point.y) for point in arrow.points] == [
+        pytest.approx(start),
+        pytest.approx(end),
+    ]
+    assert arrow.type == Marker.ARROW
+    assert arrow.color.a == pytest.approx(0.6)
+    assert (arrow.color.r, arrow.color.g, arrow.color.b) == colour_of(3)
+    thin = intent_markers(
+        dataclasses.replace(intent, probability=np.array([0.0, 0.25, 0.3])), STAMP
+    )
+    (other,) = (marker for marker in thin.markers if marker.ns == "intent")
+    assert 0 < other.scale.x < arrow.scale.x
+    labels = [by_key["intent_label", rank] for rank in (0, 2, 3)]
+    assert [label.text for label in labels] == ["another 0.15", "2 0.25", "3 0.60"]
+    assert [(label.pose.position.x, label.pose.position.y) for label in labels] == [
+        pytest.approx(start),
+        pytest.approx(start),
+        pytest.approx((start + end) / 2),
+    ]
+    assert [marker.action for marker in no_intent(grid_map, STAMP).markers] == [Marker.DELETEALL]
 
 
 def test_belief_is_the_probability_in_percent(summary, grid_map):

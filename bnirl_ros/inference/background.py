@@ -12,6 +12,7 @@ from bnirl_ros.demonstrations.placement import Placement, place
 from bnirl_ros.demonstrations.recording import Recorder
 from bnirl_ros.errors import InputError
 from bnirl_ros.inference.chains import StoppedError
+from bnirl_ros.inference.intent import IntentFilter
 from bnirl_ros.inference.posterior import Posterior, infer
 from bnirl_ros.inference.running import RunningPosterior
 from bnirl_ros.inference.settings import Settings
@@ -33,6 +34,8 @@ class Result:
         placement: the observations that it is about, and what did not fit.
         summary: what the posterior says; None while there is no observation.
         sweeps: sweeps of each chain.
+        intent_filter: tells from now on what is pursued; None while there is no observation, and
+            for a model that knows no order.
         posterior, settings: of an inference that was asked for; None for a running result.
     """
 
@@ -40,6 +43,7 @@ class Result:
     placement: Placement
     summary: Summary | None
     sweeps: int
+    intent_filter: IntentFilter | None = None
     posterior: Posterior | None = None
     settings: Settings | None = None
 
@@ -207,8 +211,11 @@ class BackgroundInference:
         except StoppedError:
             request.cancel()
             return
-        summary = summarise(posterior, grid_map)
-        result = Result(grid_map, placement, summary, settings.sweeps, posterior, settings)
+        result = replace(
+            _result_of(posterior, grid_map, placement, settings.sweeps),
+            posterior=posterior,
+            settings=settings,
+        )
         self._stands = True
         self._publish(replace(result, posterior=None), resets)
         try:
@@ -234,5 +241,15 @@ class BackgroundInference:
             running.advance(4)
             if self._changed or running.finished or time.monotonic() > end:
                 break
-        summary = summarise(running.posterior(), running.grid_map)
-        return Result(running.grid_map, running.placement, summary, running.sweeps)
+        return _result_of(running.posterior(), running.grid_map, running.placement, running.sweeps)
+
+
+def _result_of(
+    posterior: Posterior, grid_map: GridMap, placement: Placement, sweeps: int
+) -> Result:
+    """What a posterior says, and what tells the intent by it."""
+    summary = summarise(posterior, grid_map)
+    watching = None
+    if posterior.settings.model == "sequential":
+        watching = IntentFilter(posterior, summary, grid_map)
+    return Result(grid_map, placement, summary, sweeps, watching)

@@ -24,6 +24,7 @@ from bnirl_ros.demonstrations.recording import Recorder
 from bnirl_ros.errors import InputError
 from bnirl_ros.inference.background import BackgroundInference, Result
 from bnirl_ros.inference.summary import Summary, nothing_found
+from bnirl_ros.inference.watching import BackgroundWatch
 from bnirl_ros.limits import Limits
 from bnirl_ros.maps import FeatureLayer, GridMap, load_features, with_features
 from bnirl_ros.nodes.conversion import message_class, to_ros
@@ -31,8 +32,9 @@ from bnirl_ros.nodes.parameters import NodeParameter, declare, declare_settings
 from bnirl_ros.nodes.process import run, spin
 from bnirl_ros.views.belief import belief_grid
 from bnirl_ros.views.diagnostics import Health, diagnostic_array
+from bnirl_ros.views.intent import current_subgoal, intent_markers, no_intent
 from bnirl_ros.views.markers import assignment_markers, subgoal_markers
-from bnirl_ros.views.messages import MarkerArray, Message, OccupancyGrid
+from bnirl_ros.views.messages import MarkerArray, Message, OccupancyGrid, PoseStamped
 from bnirl_ros.views.messages import Path as PathMessage
 from bnirl_ros.views.results import write_results
 from bnirl_ros.views.waypoint_files import read_waypoints
@@ -77,8 +79,10 @@ OUTPUTS = {
     "assignments": MarkerArray.TYPE,
     "waypoints": PathMessage.TYPE,
     "subgoal_belief": OccupancyGrid.TYPE,
+    "current_subgoal": PoseStamped.TYPE,
+    "intent": MarkerArray.TYPE,
 }
-"""Message type of each topic that shows the posterior; all latched."""
+"""Message type of each topic that shows the posterior, or what is pursued now; all latched."""
 
 View = Callable[[Summary, GridMap, int], Message]
 """Shows a summary on a map, in a message with this stamp [ns]."""
@@ -92,7 +96,7 @@ class SubgoalNode(Node):
     """Takes in poses, actions and maps, and publishes the subgoals that explain them.
 
     Topics, services and parameters are those of the README. Callbacks only record; a thread of
-    its own infers, and a timer publishes what it found.
+    its own infers, another one tells what is pursued now, and a timer publishes what they found.
     """
 
     def __init__(self) -> None:
@@ -114,6 +118,8 @@ class SubgoalNode(Node):
             self._saved_waypoints = read_waypoints(Path(own["waypoints_file"]).expanduser())
         self._recorder = Recorder(own["waiting_limit"])
         self._inference = BackgroundInference(self._recorder, settings, own["episode_gap"])
+        self._watch = BackgroundWatch(self._recorder, own["episode_gap"])
+        self._shown: dict[str, Message] = {}  # the last messages on what is pursued now
         self._faults: Counter[str] = Counter()
         self._result: Result | None = None
         self._assignments_due = False
@@ -149,8 +155,9 @@ class SubgoalNode(Node):
         self.create_timer(1.0, self._publish_diagnostics)
 
     def close(self) -> None:
-        """End the inference, then the node."""
+        """End the inference and the watch, then the node."""
         self._inference.close()
+        self._watch.close()
         self.destroy_node()
 
     def _on_pose(self, message: Any) -> None:
@@ -164,6 +171,7 @@ class SubgoalNode(Node):
             self._log_fault(fault, self._recorder.faults[fault])
         else:
             self._inference.observations_arrived()
+            self._watch.observations_arrived()
 
     def _on_map(self, message: Any) -> None:
         try:
@@ -251,6 +259,10 @@ class SubgoalNode(Node):
         result = self._inference.take_result()
         if result is not None:
             self._publish(result)
+        told = self._watch.take()
+        if told is not None:
+            self._show("current_subgoal", current_subgoal(*told))
+            self._show("intent", intent_markers(*told))
         now = self.get_clock().now().nanoseconds
         since = now - self._assignments_at
         if self._assignments_due and not 0 <= since < _ASSIGNMENTS_PERIOD * 1e9:
@@ -268,6 +280,16 @@ class SubgoalNode(Node):
             self._send_saved_waypoints()
         self._send("subgoal_belief", belief_grid, result, now)
         self._assignments_due = True
+        self._watch.use(result.intent_filter)
+        if result.intent_filter is None and self._shown:
+            self._shown.clear()
+            self._outputs["intent"].publish(to_ros(no_intent(result.grid_map, now)))
+
+    def _show(self, name: str, view: Message | None) -> None:
+        """Publish what is pursued now, unless that is what was published last."""
+        if view is not None and view != self._shown.get(name):
+            self._shown[name] = view
+            self._outputs[name].publish(to_ros(view))
 
     def _send(self, name: str, view: View, result: Result, stamp: int) -> None:
         summary = result.summary or nothing_found(result.grid_map)
@@ -288,14 +310,14 @@ class SubgoalNode(Node):
         health = Health(
             name=self.get_fully_qualified_name().lstrip("/"),
             paused=self._inference.paused,
-            idle=self._inference.idle,
+            idle=self._inference.idle and self._watch.idle,
             observations=len(result.placement.demonstration) if result else 0,
             waiting=len(self._recorder) - (result.placement.messages if result else 0),
             sweeps=result.sweeps if result else 0,
             summary=result.summary if result else None,
             faults=faults,
-            error=self._inference.error,
-            last_error=self._inference.last_error,
+            error=self._inference.error or self._watch.error,
+            last_error=self._inference.last_error or self._watch.last_error,
         )
         view = diagnostic_array(health, self.get_clock().now().nanoseconds)
         self._diagnostics.publish(to_ros(view))

@@ -49,7 +49,7 @@ def subgoal_markers(summary: Summary, grid_map: GridMap, stamp_ns: int) -> Marke
     header = header_of(grid_map.frame_id, stamp_ns)
     yaw = headings(summary)
     size = max(grid_map.resolution, SMALLEST)
-    markers = [_delete_all(header)]
+    markers = [delete_all(header)]
     for subgoal in summary.subgoals:
         markers += _markers_of(subgoal, yaw[subgoal.rank], size, header)
         if subgoal.cells:
@@ -70,7 +70,7 @@ def assignment_markers(summary: Summary, grid_map: GridMap, stamp_ns: int) -> Ma
         stamp_ns: stamp of every marker [ns].
     """
     header = header_of(grid_map.frame_id, stamp_ns)
-    markers = [_delete_all(header)]
+    markers = [delete_all(header)]
     unexplained = [0] if (summary.rank_of == 0).any() else []
     for rank in unexplained + [subgoal.rank for subgoal in summary.subgoals]:
         pairs = np.unique(summary.observations[summary.rank_of == rank, 1:].reshape(-1, 3), axis=0)
@@ -83,21 +83,22 @@ def assignment_markers(summary: Summary, grid_map: GridMap, stamp_ns: int) -> Ma
                 type=Marker.LINE_LIST,
                 action=Marker.ADD,
                 scale=Vector3(x=0.08 * grid_map.resolution),
-                color=_opaque(colour_of(rank)),
+                color=opaque(colour_of(rank)),
                 points=[Point(x=x, y=y) for x, y in ends.tolist()],
             )
         )
     return MarkerArray(markers=markers)
 
 
-def _delete_all(header: Header) -> Marker:
+def delete_all(header: Header) -> Marker:
+    """The marker with which every array begins."""
     return Marker(header=header, action=Marker.DELETEALL)
 
 
 def _markers_of(subgoal: Subgoal, yaw: float, size: float, header: Header) -> list[Marker]:
     """The three markers of one subgoal, for cells with an edge of `size` [m]."""
     radius = 0.3 * size
-    colour = _opaque(colour_of(subgoal.rank))
+    colour = opaque(colour_of(subgoal.rank))
     return [
         Marker(
             header=header,
@@ -128,7 +129,7 @@ def _markers_of(subgoal: Subgoal, yaw: float, size: float, header: Header) -> li
             pose=pose_of(subgoal.position, z=radius + LABEL_ABOVE),
             scale=Vector3(z=0.4 * size),
             # Seen from above the label lies on its sphere and on free space, which is light.
-            color=_opaque(INK),
+            color=opaque(INK),
             text=f"wp_{subgoal.rank} {subgoal.probability:.2f}",
         ),
     ]
@@ -162,6 +163,7 @@ def _lines(pairs: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
     return np.concatenate([moves, crosses.reshape(-1, 2, 2)])
 
 
-def _opaque(colour: Colour) -> ColorRGBA:
+def opaque(colour: Colour) -> ColorRGBA:
+    """A colour through which nothing is seen."""
     red, green, blue = colour
     return ColorRGBA(r=red, g=green, b=blue, a=1.0)
