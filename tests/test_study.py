@@ -20,6 +20,7 @@ from bnirl_ros.experiments.overcooked import LAYOUTS
 from bnirl_ros.experiments.paper.courses import RIVAL_NAMES
 from bnirl_ros.experiments.study import (
     cost,
+    intent,
     kitchens,
     next_action,
     reliability,
@@ -246,7 +247,7 @@ def test_an_episodes_first_cell_is_entered() -> None:
     assert kitchens.entries(paths).tolist() == [[1, 1], [2, 1], [2, 1], [1, 1]]
 
 
-@pytest.mark.parametrize("part", [kitchens.PART, next_action.PART])
+@pytest.mark.parametrize("part", [kitchens.PART, next_action.PART, intent.PART])
 def test_parts_without_their_recordings_say_so(part: Part, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"random3.*cannot be read|there is no such folder"):
         part.cases(tmp_path / "nowhere")
@@ -344,6 +345,111 @@ def test_the_table_has_both_losses_of_every_prediction() -> None:
     assert rows[0] == ("one", "log", *["0.500 (0.400-0.600)"] * 3)
     assert rows[1] == ("other", "log", *["infinite"] * 3)
     assert rows[2] == ("one", "0-1 [%]", *["25.0 (20.0-30.0)"] * 3)
+
+
+# What is gone for now
+
+
+def test_legs_lead_from_one_arrival_to_the_next() -> None:
+    walked = in_corridor(
+        *[(3, 0, "E"), (3, 1, "W"), (3, 0, "stay"), (3, 0, "stay"), (3, 0, "E"), (3, 1, "W")],
+        *[(3, 0, "E"), (3, 1, "stay")],
+        *[(4, 0, "E"), (4, 1, "W"), (4, 0, "E")],
+    )
+    arrivals = [(2, 0), (3, 0), (7, 1), (10, 1)]
+    # The second stay is no leg. Who arrives by a move leaves with the next one.
+    assert intent.legs_between(walked, arrivals) == [
+        intent.Leg(first=0, steps=2, goal=0),
+        intent.Leg(first=4, steps=3, goal=1),
+        intent.Leg(first=8, steps=2, goal=1),
+    ]
+    passing = intent.legs_between(walked, [(4, 0), (6, 1)])
+    assert passing[1] == intent.Leg(first=4, steps=2, goal=1)
+
+
+def test_a_goal_is_named_for_good_after_the_last_doubt() -> None:
+    course = intent.Course(0, right=[0.6, 0.2, 0.4, 0.3], wrong=[0.1, 0.6, 0.4, 0.2])
+    assert [course.named(step) for step in range(4)] == [True, False, False, True]
+    assert course.named_after == 3
+    assert intent.Course(0, [0.2, 0.7], [0.1, 0.1]).named_after == 0
+    assert intent.Course(0, [0.6, 0.4], [0.1, 0.5]).named_after == 2  # never
+    assert [course.step_at(moment) for moment in (0.0, 0.25, 0.5, 0.75, 1.0)] == [0, 1, 2, 3, 3]
+    assert intent.Course(0, [0.5] * 3, [0.5] * 3).step_at(0.5) == 1
+
+
+def test_courses_tell_the_belief_on_the_way() -> None:
+    held_out = in_corridor((0, 0, "E"), (0, 1, "W"), (0, 0, "E"), (0, 1, "stay"))
+    watched = intent.Watched(
+        learnt=held_out,
+        held_out=held_out,
+        grid_map=CORRIDOR,
+        legs=[intent.Leg(first=1, steps=2, goal=1)],
+        places=[{(1, 0)}, {(0, 0), (5, 5)}],
+        group=[7],
+        settings=Settings(),
+    )
+    before = np.array([[0.5, 0.5], [0.1, 0.9], [0.2, 0.8], [0.3, 0.7]])
+    after = np.array([[0.6, 0.4], [0.75, 0.25], [0.9, 0.1], [1.0, 0.0]])
+    (course,) = intent.courses_of(watched, [(0, 0), (1, 0)], before, after)
+    assert course == intent.Course(7, right=[0.1, 0.75], wrong=[0.9, 0.25])
+    # A place where no subgoal was found is never told.
+    (course,) = intent.courses_of(watched, [(2, 0), (1, 0)], before, after)
+    assert course == intent.Course(7, right=[0.0, 0.0], wrong=[0.9, 0.75])
+
+
+def test_the_turtle_arrives_at_its_waypoints_in_order() -> None:
+    ends = np.array(intent.WAYPOINTS)
+    way = np.concatenate([ends[:2], ends[3:4], ends[2:], ends[:2] + 0.5])
+    arrivals = intent.waypoint_arrivals(way)
+    assert arrivals == [(0, 0), (1, 1), (3, 2), (4, 3), (5, 4), (6, 5), (7, 0), (8, 1)]
+
+
+@pytest.mark.parametrize("source", list(intent.SOURCES)[:2])
+def test_what_the_turtle_goes_for_is_measured(
+    source: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    quick = dict(sweeps=200, burn_in=100, chains=1)
+    monkeypatch.setattr(intent, "settings_of", lambda model: Settings(model=model, **quick))
+    result = intent.run(intent.Case(Path(), source))
+    courses = [intent.Course(**course) for course in result["courses"]]
+    assert len(courses) == (9 if source.endswith("drive") else 3)
+    assert sum(len(course.right) for course in courses) <= 134
+    for course in courses:
+        assert 0.0 <= min(course.right) <= max(course.right) <= 1.0
+        assert course.right[-1] > course.right[0]  # it comes to know
+    told = intent.table([{**result, "source": name} for name in intent.SOURCES]).markdown()
+    assert f"| legs |{f' {len(courses)} |' * len(intent.SOURCES)}" in told
+    assert told.count("\n| its probability ") == len(intent.MOMENTS)
+    assert told.count("\n|") == 2 + 2 + len(intent.MEASURES)
+
+
+def test_a_mean_over_legs_is_drawn_again_by_groups() -> None:
+    sure, never = intent.Course(1, [0.9, 0.9], [0.0, 0.0]), intent.Course(2, [0.1], [0.9])
+    value, (low, high) = intent.mean([sure, sure, sure, never], lambda course: course.right[0])
+    assert value == pytest.approx(0.7)
+    assert (low, high) == (0.1, 0.9)
+
+
+def test_kitchens_are_watched_where_nobody_learnt(tmp_path: Path) -> None:
+    # Four episodes, two trials: from one end to the other, to interact there, and back.
+    (tmp_path / "hall.grid.txt").write_text("XXXXXX\nX    X\nXXXXXX\n")
+    there = [(x, "E") for x in (1, 2, 3)] + [(4, "I")]
+    back = [(x, "W") for x in (4, 3, 2)] + [(1, "I")]
+    rows = [
+        f"{episode},{time},{x},1,{action},{int(action == 'I')}"
+        for episode in range(4)
+        for time, (x, action) in enumerate(there + back)
+    ]
+    header = "episode,t,x,y,action,interact_ok"
+    (tmp_path / "hall.csv").write_text("\n".join([header, *rows]))
+    watched = intent.of_kitchen(tmp_path, "hall")
+    assert set(watched.learnt.episode) == {0, 1}
+    assert set(watched.held_out.episode) == {2, 3}
+    assert watched.places == [{(1, 1)}, {(4, 1)}]
+    assert watched.legs == [
+        intent.Leg(first, 3, goal) for first, goal in ((0, 1), (4, 0), (8, 1), (12, 0))
+    ]
+    assert watched.group == [1, 1, 1, 1]
 
 
 def test_players_of_a_trial_stay_together() -> None:

@@ -56,6 +56,15 @@ class Intent:
         return self.summary.subgoals[int(self.probability.argmax())]
 
 
+def by_subgoal(belief: npt.NDArray[np.float64], summary: Summary) -> npt.NDArray[np.float64]:
+    """(..., J) probability of each subgoal, by rank, from that of the candidates (..., G).
+
+    Candidates that count as one subgoal are summed; those that are none are left out.
+    """
+    ranks = np.arange(len(summary.subgoals)) + 1
+    return belief @ (summary.rank_of_candidate[:, None] == ranks)
+
+
 class IntentFilter:
     """Tells the intent of whoever demonstrates, from one posterior, as the demonstration grows.
 
@@ -102,11 +111,9 @@ class IntentFilter:
         except InputError:
             self._taken = self._taken[:0]
             return None
-        subgoals = len(self._summary.subgoals)
-        mass = np.bincount(self._summary.rank_of_candidate, belief, minlength=subgoals + 1)
-        return Intent(
-            self.grid_map, self._summary, mass[1:], (int(cell[0]), int(cell[1])), int(pose)
-        )
+        probability = by_subgoal(belief, self._summary)
+        place = int(cell[0]), int(cell[1])
+        return Intent(self.grid_map, self._summary, probability, place, int(pose))
 
     def _take(
         self, demonstration: Demonstration, poses: npt.NDArray[np.int64], first: int

@@ -17,6 +17,7 @@ from bnirl_ros.errors import InputError
 from bnirl_ros.experiments.overcooked import add_option
 from bnirl_ros.experiments.study import (
     cost,
+    intent,
     kitchens,
     next_action,
     reliability,
@@ -27,7 +28,7 @@ from bnirl_ros.experiments.study.part import Part
 
 PARTS = {
     module.PART.name: module.PART
-    for module in (turtle, kitchens, next_action, robustness, reliability, cost)
+    for module in (turtle, kitchens, next_action, intent, robustness, reliability, cost)
 }
 
 _TELLS = 10  # lines of progress in a part
