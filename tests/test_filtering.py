@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,7 +27,7 @@ from bnirl_ros.maps import GridMap, parse_text_grid
 from bnirl_ros.mdp.actions import ACTION_NAMES
 from bnirl_ros.mdp.goal_values import goal_values
 from bnirl_ros.model.likelihood import action_log_likelihood
-from bnirl_ros.model.pursuits import PRIORS, PursuitModel
+from bnirl_ros.model.pursuits import PRIORS, PursuitModel, action_costs
 from pursuit_reference import (
     Parameters,
     PursuitEnumeration,
@@ -270,6 +271,41 @@ def test_cells_that_the_posterior_never_saw_are_watched_too(
     second = watching.observe_all(watched.cells[half:], watched.action[half:])
     np.testing.assert_allclose(np.concatenate([first, second]), after, rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(expected, before[half], rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("success", [0.7, 0.9], ids=["the same world", "another world"])
+def test_goal_values_of_an_older_filter_change_nothing(
+    success: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watched = episode(walked(seed=3)[0], 0)
+    whole, _ = walked(seed=0)
+
+    def learnt(count: int, **settings: object) -> Posterior:
+        first = Demonstration(
+            whole.episode[:count],
+            whole.cells[:count],
+            whole.action[:count],
+            *WITHOUT_LAST_POSES,
+        )
+        return infer(first, MAP, Settings(**ONE_DRAW, **settings))
+
+    before = SubgoalFilter(learnt(6), MAP)
+    before.observe_all(watched.cells, watched.action)  # all the map is known to it
+    posterior = learnt(14, success=success)
+    assert len(before.candidates) < len(posterior.candidates)
+    expected = SubgoalFilter(posterior, MAP).observe_all(watched.cells, watched.action)
+    solved: list[int] = []
+
+    def counted(*of: Any) -> npt.NDArray[np.float64]:
+        solved.append(len(of[2]))
+        return action_costs(*of)
+
+    monkeypatch.setattr(filtering, "action_costs", counted)
+    after = SubgoalFilter(posterior, MAP, before)
+    told = after.observe_all(watched.cells, watched.action)
+    np.testing.assert_allclose(told, expected, rtol=1e-9, atol=1e-15)
+    new = len(posterior.candidates) - len(before.candidates)
+    assert solved == [new if success == 0.7 else len(posterior.candidates)]
 
 
 def test_a_new_episode_forgets_the_one_before() -> None:

@@ -73,6 +73,7 @@ class BackgroundInference:
         self._requests: list[tuple[Future[Result], Callable[[Result], None] | None]] = []
         self._result: Result | None = None
         self._running: RunningPosterior | None = None
+        self._watching: IntentFilter | None = None  # of the last result
         self._stands = False  # the last result was asked for, and nothing has changed since
         self._forget = False
         self._resets = 0
@@ -212,7 +213,7 @@ class BackgroundInference:
             request.cancel()
             return
         result = replace(
-            _result_of(posterior, grid_map, placement, settings.sweeps),
+            self._result_of(posterior, grid_map, placement, settings.sweeps),
             posterior=posterior,
             settings=settings,
         )
@@ -241,15 +242,17 @@ class BackgroundInference:
             running.advance(4)
             if self._changed or running.finished or time.monotonic() > end:
                 break
-        return _result_of(running.posterior(), running.grid_map, running.placement, running.sweeps)
+        return self._result_of(
+            running.posterior(), running.grid_map, running.placement, running.sweeps
+        )
 
-
-def _result_of(
-    posterior: Posterior, grid_map: GridMap, placement: Placement, sweeps: int
-) -> Result:
-    """What a posterior says, and what tells the intent by it."""
-    summary = summarise(posterior, grid_map)
-    watching = None
-    if posterior.settings.model == "sequential":
-        watching = IntentFilter(posterior, summary, grid_map)
-    return Result(grid_map, placement, summary, sweeps, watching)
+    def _result_of(
+        self, posterior: Posterior, grid_map: GridMap, placement: Placement, sweeps: int
+    ) -> Result:
+        """What a posterior says, and what tells the intent by it."""
+        summary = summarise(posterior, grid_map)
+        watching = None
+        if posterior.settings.model == "sequential":
+            watching = IntentFilter(posterior, summary, grid_map, self._watching)
+        self._watching = watching
+        return Result(grid_map, placement, summary, sweeps, watching)

@@ -185,16 +185,54 @@ class _ActionCosts:
     """What actions cost in any state: as the posterior has it, and elsewhere found when asked for.
 
     To find it takes as long for many states as for one, so it is found for as many of those around
-    as there is room for.
+    as there is room for. What was found `before`, for an older posterior, is kept.
     """
 
-    def __init__(self, posterior: Posterior, world: GridWorld) -> None:
+    def __init__(
+        self, posterior: Posterior, world: GridWorld, before: _ActionCosts | None
+    ) -> None:
         assert isinstance(posterior.model, PursuitModel)
-        self._goals, self._world = posterior.candidates.goals, world
+        self._candidates, self._world = posterior.candidates, world
         self._likelihood = posterior.settings.likelihood
         visited = np.unique(world.states_of(posterior.demonstration.cells))
         self._known = dict(zip(visited.tolist(), posterior.model.cost, strict=True))
         self._found: dict[int, npt.NDArray[np.float64]] = {}
+        if before and self._is_about_the_same_as(before):
+            self._found = self._kept(before)
+
+    def _is_about_the_same_as(self, other: _ActionCosts) -> bool:
+        mine, others = self._world, other._world
+        return (
+            np.array_equal(mine.free, others.free)
+            and (mine.moves, mine.success, mine.discount, self._likelihood)
+            == (others.moves, others.success, others.discount, other._likelihood)
+            and not self._candidates.are_features
+            and not other._candidates.are_features
+        )
+
+    def _kept(self, before: _ActionCosts) -> dict[int, npt.NDArray[np.float64]]:
+        """What was found before, with columns for the candidates that are new."""
+        known = {
+            state: costs for state, costs in before._found.items() if state not in self._known
+        }
+        states = list(known)[: self._room]
+        if not states:
+            return {}
+        now, then = self._candidates.goals.states, before._candidates.goals.states
+        _, kept, old = np.intersect1d(now, then, return_indices=True)
+        new = np.setdiff1d(np.arange(len(now)), kept)
+        costs = np.empty((len(states), len(self._world.actions), len(now)))
+        for row, state in enumerate(states):
+            costs[row][:, kept] = known[state][:, old]
+        if len(new):
+            goals = self._candidates.take(new).goals
+            costs[:, :, new] = action_costs(self._world, np.array(states), goals, self._likelihood)
+        return dict(zip(states, costs, strict=True))
+
+    @property
+    def _room(self) -> int:
+        """For how many states."""
+        return _ROOM // (len(self._world.actions) * len(self._candidates))
 
     def of(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
         """(U, A, G) the costs in each of the states, in which candidates can be reached."""
@@ -202,7 +240,8 @@ class _ActionCosts:
         further = [state for state in asked if state not in self._known]
         if not self._found.keys() >= set(further):
             found = self._around(np.array(further))
-            costs = action_costs(self._world, found, self._goals, self._likelihood)
+            goals = self._candidates.goals
+            costs = action_costs(self._world, found, goals, self._likelihood)
             self._found = dict(zip(found.tolist(), costs, strict=True))
         return np.stack([self._known.get(state, self._found.get(state)) for state in asked])
 
@@ -212,8 +251,7 @@ class _ActionCosts:
         others = np.setdiff1d(free, [*self._known, *states])
         cells, last = self._world.cells_of(others), self._world.cells_of(states[-1:])
         nearest = np.argsort(np.abs(cells - last).max(axis=1), kind="stable")
-        room = _ROOM // (len(self._world.actions) * len(self._goals))
-        return np.concatenate([states, others[nearest[: max(0, room - len(states))]]])
+        return np.concatenate([states, others[nearest[: max(0, self._room - len(states))]]])
 
 
 class SubgoalFilter:
@@ -224,8 +262,15 @@ class SubgoalFilter:
     the posterior never acted, now and then the goal values of all candidates have to be solved.
     """
 
-    def __init__(self, posterior: Posterior, grid_map: GridMap) -> None:
+    def __init__(
+        self, posterior: Posterior, grid_map: GridMap, before: SubgoalFilter | None = None
+    ) -> None:
         """A filter for a demonstrator like the one of a posterior, on the same map.
+
+        Args:
+            posterior: of the sequential model.
+            grid_map: the map on which it was inferred.
+            before: of an older posterior, whose goal values are used again as far as they hold.
 
         Raises:
             InputError: the posterior is not one of the sequential model.
@@ -235,7 +280,8 @@ class SubgoalFilter:
         self._settings = posterior.settings
         self._world = grid_world(grid_map, posterior.settings)
         self._radius = posterior.settings.arrival_radius / grid_map.resolution
-        self._costs = _ActionCosts(posterior, self._world)
+        older = before._costs if before else None
+        self._costs: _ActionCosts = _ActionCosts(posterior, self._world, older)
         self._parts = self._world.parts_of(
             self.candidates.goals.states[self.candidates.goals.first[:-1]]
         )

@@ -71,20 +71,28 @@ class IntentFilter:
     An observation is taken in once, so an episode of T costs O(T G) in all; see `SubgoalFilter`.
     """
 
-    def __init__(self, posterior: Posterior, summary: Summary, grid_map: GridMap) -> None:
+    def __init__(
+        self,
+        posterior: Posterior,
+        summary: Summary,
+        grid_map: GridMap,
+        before: IntentFilter | None = None,
+    ) -> None:
         """A filter for whoever goes on like the demonstrator of a posterior.
 
         Args:
             posterior: of the sequential model.
             summary: `summarise` of it.
             grid_map: the map on which it was inferred.
+            before: of an older posterior, whose goal values are used again as far as they hold.
 
         Raises:
             InputError: the posterior is not one of the sequential model.
         """
         self.grid_map, self.settings = grid_map, posterior.settings
         self._summary = summary
-        self._filter = SubgoalFilter(posterior, grid_map)
+        older = before._filter if before else None
+        self._filter: SubgoalFilter = SubgoalFilter(posterior, grid_map, older)
         self._taken = np.empty(0, dtype=np.int64)  # poses of what the filter has observed
         self._belief = np.empty(0)
 
