@@ -15,6 +15,7 @@ from numba import njit
 from bnirl_ros.errors import InputError
 from bnirl_ros.inference.posterior import Posterior, grid_world
 from bnirl_ros.inference.pursuit_gibbs import (
+    KernelModel,
     forward_pass,
     kernel_model,
     softmax_table,
@@ -52,15 +53,21 @@ def filtered(
             the part of the map where the demonstrator is.
         parameters: in the order of `PRIORS`.
     """
-    kernel = kernel_model(model)
-    chosen = softmax_table(kernel, parameters[ALPHA])
+    return _filtered(kernel_model(model), weights, parameters)
+
+
+def _filtered(
+    model: KernelModel, weights: npt.NDArray[np.float64], parameters: npt.NDArray[np.float64]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """`filtered` of a model as the kernels take it."""
+    chosen = softmax_table(model, parameters[ALPHA])
     belief = np.empty((len(model.state_of), len(weights)))
     evidence = np.empty(len(belief))
     bounds = [*np.flatnonzero(model.starts), len(belief)]
     for first, end in pairwise(bounds):
         here = model.candidate_part == model.state_part[model.state_of[first]]
         forward_pass(
-            kernel,
+            model,
             parameters,
             chosen,
             np.where(here, weights, 0.0),
@@ -83,8 +90,9 @@ def foreseen(
     Args:
         model, weights, parameters: as in `filtered`.
     """
-    result = filtered(model, weights, parameters)[0]
-    _one_step_back(kernel_model(model), parameters, weights, result)
+    kernel = kernel_model(model)
+    result = _filtered(kernel, weights, parameters)[0]
+    _one_step_back(kernel, parameters, weights, result)
     return result
 
 
@@ -277,7 +285,7 @@ class SubgoalFilter:
         """
         self._weights, self._parameters = middle_of_draws(posterior)
         self.candidates = posterior.candidates
-        self._settings = posterior.settings
+        self._settings, self._grid_map = posterior.settings, grid_map
         self._world = grid_world(grid_map, posterior.settings)
         self._radius = posterior.settings.arrival_radius / grid_map.resolution
         older = before._costs if before else None
@@ -373,13 +381,10 @@ class SubgoalFilter:
     def _states_of(self, cells: npt.ArrayLike) -> npt.NDArray[np.int64]:
         """(N,) state numbers of cells (N, 2) from which a candidate can be reached."""
         places = np.asarray(cells, dtype=np.int64).reshape(-1, 2)
-        height, width = self._world.free.shape
+        known = self._grid_map.is_free(places)
         # The number of a state tells nothing of a cell beyond the map's edge.
-        known = ((places >= 0) & (places < (width, height))).all(axis=1)
         states = self._world.states_of(places[known])
-        known[known] = self._world.free.reshape(-1)[states] & np.isin(
-            self._world.parts_of(states), self._parts
-        )
+        known[known] = np.isin(self._world.parts_of(states), self._parts)
         for x, y in places[~known][:1].tolist():
             raise InputError(f"cell ({x}, {y}): no candidate can be reached from it")
         return states

@@ -99,14 +99,16 @@ class GridWorld:
         return np.where((bits[:, None] >> positions) & 1, positions, 0)
 
     def parts_of(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """(U,) number of the connected part of the free space in which each state lies.
+        """(U,) number of the connected part of the free space in which each state lies."""
+        return np.asarray(self._part_of_state[states], dtype=np.int64)
 
-        A diagonal move needs both cells beside it, so the parts are those of moves to the sides.
-        """
+    @cached_property
+    def _part_of_state(self) -> npt.NDArray[np.int32]:
+        """(S,) diagonal moves need both cells beside them, so moves to the sides tell parts."""
         from scipy.ndimage import label  # here, since only this needs it
 
         parts, _ = label(self.free)
-        return np.asarray(parts.reshape(-1)[states], dtype=np.int64)
+        return np.asarray(parts.reshape(-1), dtype=np.int32)
 
     def places_of(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """(U, 2) where each state lies: its cell."""

@@ -80,10 +80,12 @@ class Candidates:
         from scipy.spatial import KDTree  # here, since only this needs it
 
         distinct, row_of = np.unique(cells, axis=0, return_inverse=True)
-        reached = np.empty((len(distinct), len(self)), dtype=np.bool_)
-        for candidate in range(len(self)):
-            apart, _ = KDTree(self.cells_of(candidate)).query(distinct)
-            reached[:, candidate] = apart <= radius
+        reached = np.zeros((len(distinct), len(self)), dtype=np.bool_)
+        if len(distinct) and len(self):
+            near = KDTree(distinct).sparse_distance_matrix(
+                KDTree(self.cells), radius, output_type="ndarray"
+            )
+            reached[near["i"], self.goals.goal_of[near["j"]]] = True
         return np.asarray(reached[row_of.reshape(-1)])
 
 
