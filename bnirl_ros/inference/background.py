@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
-from threading import Condition, Event, Thread
+from threading import Event
 
 from bnirl_ros.demonstrations.placement import Placement, place
 from bnirl_ros.demonstrations.recording import Recorder
@@ -17,6 +17,7 @@ from bnirl_ros.inference.posterior import Posterior, infer
 from bnirl_ros.inference.running import RunningPosterior
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.inference.summary import Summary, summarise
+from bnirl_ros.inference.worker import Worker
 from bnirl_ros.maps.grid_map import GridMap
 
 # Sweeping time [s] between two results: soon for the first one after a change, then longer, so
@@ -48,28 +49,15 @@ class Result:
     settings: Settings | None = None
 
 
-class BackgroundInference:
-    """Keeps a posterior up to date with a recorder, in a thread of its own.
-
-    All methods return at once. Whatever goes wrong in the thread is remembered and the next change
-    tried again: it never ends before `close`.
-
-    Attributes:
-        error: what went wrong at the last try, in one sentence; empty if nothing did.
-        last_error: what went wrong last, at whatever try.
-    """
+class BackgroundInference(Worker):
+    """Keeps a posterior up to date with a recorder."""
 
     def __init__(self, recorder: Recorder, settings: Settings, episode_gap: float) -> None:
         """Start the thread; it waits for a map and observations."""
-        self.error = self.last_error = ""
-        self._recorder = recorder
+        super().__init__("inference", recorder, episode_gap)
         self._settings = settings
-        self._episode_gap = episode_gap
         self._grid_map: GridMap | None = None
-        self._changed = False
         self._paused = False
-        self._closed = False
-        self._at_work = False
         self._requests: list[tuple[Future[Result], Callable[[Result], None] | None]] = []
         self._result: Result | None = None
         self._running: RunningPosterior | None = None
@@ -78,14 +66,7 @@ class BackgroundInference:
         self._forget = False
         self._resets = 0
         self._stop = Event()
-        self._wake = Condition()
-        self._thread = Thread(target=self._run, name="inference", daemon=True)
         self._thread.start()
-
-    def observations_arrived(self) -> None:
-        """There is something new in the recorder."""
-        if not self._changed:  # a plain look first: this is called for every message
-            self._update(_changed=True)
 
     def use_map(self, grid_map: GridMap) -> None:
         """Put all observations on this map from now on."""
@@ -138,13 +119,7 @@ class BackgroundInference:
     def close(self) -> None:
         """End the thread, as soon as the sweeps under way are done."""
         self._stop.set()
-        self._update(_closed=True)
-        self._thread.join()
-
-    def _update(self, **values: object) -> None:
-        with self._wake:
-            vars(self).update(values)
-            self._wake.notify()
+        super().close()
 
     def _has_work(self) -> bool:
         changed = self._changed and self._grid_map is not None
@@ -170,8 +145,8 @@ class BackgroundInference:
                 else:
                     self._publish(self._next_running_result(), resets)
                 self.error = ""
-            except Exception as error:  # a thread that died would go unnoticed
-                self.error = self.last_error = f"{type(error).__name__}: {error}"
+            except Exception as error:
+                self._remember(error)
                 self._running = None
                 if request and not request.done():
                     request.set_exception(error)

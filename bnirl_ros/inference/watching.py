@@ -3,45 +3,25 @@
 from __future__ import annotations
 
 import time
-from threading import Condition, Thread
 
 from bnirl_ros.demonstrations.placement import place
 from bnirl_ros.demonstrations.recording import Recorder
 from bnirl_ros.inference.intent import Intent, IntentFilter
+from bnirl_ros.inference.worker import Worker
 
 _PERIOD = 0.1  # [s] between two looks at the recorder, at the least
 
 
-class BackgroundWatch:
-    """Keeps the intent of a demonstrator up to date with a recorder, in a thread of its own.
-
-    All methods return at once. Whatever goes wrong in the thread is remembered and the next change
-    tried again: it never ends before `close`.
-
-    Attributes:
-        error: what went wrong at the last try, in one sentence; empty if nothing did.
-        last_error: what went wrong last, at whatever try.
-    """
+class BackgroundWatch(Worker):
+    """Keeps the intent of a demonstrator up to date with a recorder."""
 
     def __init__(self, recorder: Recorder, episode_gap: float) -> None:
         """Start the thread; it waits for a filter."""
-        self.error = self.last_error = ""
-        self._recorder = recorder
-        self._episode_gap = episode_gap
+        super().__init__("watch", recorder, episode_gap)
         self._filter: IntentFilter | None = None
-        self._changed = False
-        self._at_work = False
-        self._closed = False
         self._intent: Intent | None = None
         self._stamp = 0
-        self._wake = Condition()
-        self._thread = Thread(target=self._run, name="watch", daemon=True)
         self._thread.start()
-
-    def observations_arrived(self) -> None:
-        """There is something new in the recorder."""
-        if not self._changed:  # a plain look first: this is called for every message
-            self._update(_changed=True)
 
     def use(self, intent_filter: IntentFilter | None) -> None:
         """Tell the intent by this filter, which is the thread's from now on, or none any more."""
@@ -58,16 +38,6 @@ class BackgroundWatch:
         with self._wake:
             intent, self._intent = self._intent, None
             return None if intent is None else (intent, self._stamp)
-
-    def close(self) -> None:
-        """End the thread."""
-        self._update(_closed=True)
-        self._thread.join()
-
-    def _update(self, **values: object) -> None:
-        with self._wake:
-            vars(self).update(values)
-            self._wake.notify()
 
     def _has_work(self) -> bool:
         return self._changed and self._filter is not None
@@ -87,8 +57,8 @@ class BackgroundWatch:
             try:
                 self._tell(intent_filter)
                 self.error = ""
-            except Exception as error:  # a thread that died would go unnoticed
-                self.error = self.last_error = f"{type(error).__name__}: {error}"
+            except Exception as error:
+                self._remember(error)
             with self._wake:
                 self._at_work = False
                 left = _PERIOD - (time.monotonic() - begin)
