@@ -46,7 +46,6 @@ _RELOCATED = 4000  # observations, beyond which a subgoal is relocated less than
 _RELOCATIONS = 4  # in a sweep over few observations
 _HEAVY = 1e-6  # a weight above which a candidate's place matters to a relocation
 _FARTHEST = 27.0  # logarithms and logits are not sought beyond
-_RAREST = 1e-12  # probabilities stay off 0 and 1, which would rule out what is only improbable
 
 LEAST_PROBABILITY = 1e-200
 """Of an action that cannot be: it is only very improbable, so that a filter has something left."""
