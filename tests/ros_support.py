@@ -8,18 +8,27 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import bnirl_ros
+from demonstration_support import TopicMessage
 
 rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
 _qos = importlib.import_module("rclpy.qos")
 _executors = importlib.import_module("rclpy.executors")
+_diagnostic_msgs = importlib.import_module("diagnostic_msgs.msg")
+_parameter = importlib.import_module("rclpy.parameter")
+parameter_services = importlib.import_module("rcl_interfaces.srv")
+services = importlib.import_module("std_srvs.srv")
+
+from bnirl_ros.nodes.conversion import message_class, to_ros  # noqa: E402  # needs rclpy
+from bnirl_ros.nodes.subgoal_node import INPUTS, OUTPUTS  # noqa: E402
 
 PATIENCE = 90.0
 """How long to wait for what should come at once [s]; kernels may have to be compiled first."""
@@ -156,3 +165,129 @@ class Peer:
         answer = self.ask(kind, service, request)
         self.until(answer.done, f"an answer of {service}")
         return answer.result()
+
+
+class Watched:
+    """A managed node in a process, and what it says of itself."""
+
+    def __init__(self, process: NodeProcess, peer: Peer, name: str) -> None:
+        """`name`: the node's, with its namespace."""
+        self.process, self.peer, self.name = process, peer, name
+        self._diagnostics = peer.listen(_diagnostic_msgs.DiagnosticArray, "/diagnostics", 10)
+
+    def call(self, service: str, request: Any = None) -> Any:
+        """The response of one of its own services."""
+        kind = services.SetBool if service == "pause" else services.Trigger
+        return self.peer.call(kind, f"/{self.name}/{service}", request)
+
+    def health(self) -> dict[str, str]:
+        """The newest diagnostics; empty before the first."""
+        told = [
+            status
+            for array in self._diagnostics
+            for status in array.status
+            if status.name.startswith(f"{self.name}:")
+        ]
+        if not told:
+            return {}
+        status = told[-1]
+        return {
+            **{each.key: each.value for each in status.values},
+            "level": int.from_bytes(status.level),
+            "message": status.message,
+        }
+
+    def until_health(self, what: str, **wanted: str) -> dict[str, str]:
+        """Wait for diagnostics that say so."""
+
+        def is_so() -> bool:
+            health = self.health()
+            return all(health.get(key.replace("_", " ")) == value for key, value in wanted.items())
+
+        self.peer.until(is_so, lambda: f"{what}, {wanted}; says {self.health()}")
+        return self.health()
+
+    def until_fault(self, words: str, count: int) -> None:
+        """Wait until a fault with these words was counted so often."""
+        self.peer.until(
+            lambda: any(
+                key.startswith("left out: ") and words in key and value == str(count)
+                for key, value in self.health().items()
+            ),
+            lambda: f"{count} x {words}; says {self.health()}",
+        )
+
+    def set(self, **values: Any) -> list[Any]:
+        """Set parameters, one after the other; returns the results."""
+        request = parameter_services.SetParameters.Request()
+        request.parameters = [
+            _parameter.Parameter(name, value=value).to_parameter_msg()
+            for name, value in values.items()
+        ]
+        kind = parameter_services.SetParameters
+        return self.peer.call(kind, f"/{self.name}/set_parameters", request).results
+
+
+class Subgoals(Watched):
+    """A subgoal node in a process, and all that it says."""
+
+    def __init__(self, process: NodeProcess, peer: Peer) -> None:
+        super().__init__(process, peer, "subgoal_node")
+        self.outputs = {
+            topic.name: peer.listen(message_class(topic.type_name), f"/{topic.name}")
+            for topic in OUTPUTS
+        }
+        self._publishers: dict[str, Any] = {}
+
+    def meet(self) -> None:
+        """Wait until the node hears its topics, as it does when it is active."""
+        for topic in INPUTS:
+            if topic.name not in self._publishers:
+                self._publishers[topic.name] = self.peer.publisher(
+                    message_class(topic.type_name),
+                    f"/{topic.name}",
+                    LATCHED if topic.latched else RELIABLE,
+                )
+            publisher = self._publishers[topic.name]
+            self.peer.until(
+                lambda publisher=publisher: publisher.get_subscription_count() > 0, topic.name
+            )
+        self.peer.let_them_find_us()
+
+    def send(self, *groups: list[TopicMessage]) -> None:
+        """Publish messages, in their order; they arrive all, but later."""
+        for name, view, _ in chain(*groups):
+            self._publishers[name].publish(to_ros(view))
+
+    def until_settled(self, observations: int) -> dict[str, str]:
+        """Wait until all is taken in and inference has come to its end."""
+        return self.until_health(
+            "rest", state="settled", queue="0", observations=str(observations)
+        )
+
+    def shown(self) -> dict[int, tuple[float, float]]:
+        """Place of each subgoal shown, by its rank."""
+        return {
+            marker.id: (marker.pose.position.x, marker.pose.position.y)
+            for marker in self.outputs["subgoals"][-1].markers
+            if marker.ns == "subgoal"
+        }
+
+    def until_shown(self, places: set[tuple[float, float]]) -> None:
+        """Wait until exactly these subgoals are shown."""
+        outputs = self.outputs["subgoals"]
+        self.peer.until(
+            lambda: outputs and set(self.shown().values()) == places, f"subgoals at {places}"
+        )
+
+
+def as_arguments(parameters: Mapping[str, Any]) -> list[str]:
+    words = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
+    return ["--ros-args", *words] if words else []
+
+
+def assert_silent_end(process: NodeProcess, number: signal.Signals) -> None:
+    end = process.end(number)
+    assert end.status == 0, end
+    assert "Traceback" not in end.err
+    assert "Error" not in end.err

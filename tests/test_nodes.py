@@ -8,10 +8,10 @@ import math
 import re
 import signal
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from functools import partial
-from itertools import chain, pairwise
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from bag_support import messages, same
 from bnirl_ros import cli
 from bnirl_ros.bags.demonstration import read_demonstration
-from bnirl_ros.demonstrations.messages import stamp_of
+from bnirl_ros.demonstrations.messages import TOPIC_TYPES, stamp_of
 from bnirl_ros.demonstrations.placement import place
 from bnirl_ros.experiments.demonstration_bag import first_episodes, write_demonstration
 from bnirl_ros.experiments.scenarios import PAPER_LOOP
@@ -42,7 +42,6 @@ from demonstration_support import (
     OBSERVATIONS_OF_WALK,
     SECOND,
     START,
-    TopicMessage,
     bad_maps,
     bad_messages,
     bag_with_odd_topic,
@@ -52,162 +51,34 @@ from demonstration_support import (
     walk,
     write_bag,
 )
-from ros_support import LATCHED, RELIABLE, NodeProcess, Peer, isolate
+from ros_support import (
+    LATCHED,
+    RELIABLE,
+    NodeProcess,
+    Peer,
+    Subgoals,
+    as_arguments,
+    assert_silent_end,
+    parameter_services,
+    services,
+)
 
 from bnirl_ros.nodes.conversion import message_class, to_ros  # isort: skip  # needs rclpy
+from bnirl_ros.nodes.managed import AUTOSTART  # isort: skip
 from bnirl_ros.nodes.parameters import INFERRED, parameter_of  # isort: skip
-from bnirl_ros.nodes.subgoal_node import OUTPUTS, PARAMETERS  # isort: skip
+from bnirl_ros.nodes.subgoal_node import INPUTS, OUTPUTS, PARAMETERS  # isort: skip
 
 diagnostic_msgs = importlib.import_module("diagnostic_msgs.msg")
 interfaces = importlib.import_module("rcl_interfaces.msg")
-parameter_services = importlib.import_module("rcl_interfaces.srv")
 rclpy_parameter = importlib.import_module("rclpy.parameter")
 rclpy_qos = importlib.import_module("rclpy.qos")
-services = importlib.import_module("std_srvs.srv")
 
 pytestmark = pytest.mark.timeout(180)
 
 PAPER_BAG = BAGS / PAPER_LOOP.name
 HUMAN_BAG = BAGS / "overcooked_asymmetric_advantages"
-QUICK = {"sweeps": 300, "burn_in": 100}
-INPUTS = {
-    "map": ("nav_msgs/msg/OccupancyGrid", LATCHED),
-    "pose": ("geometry_msgs/msg/PoseStamped", RELIABLE),
-    "action": ("geometry_msgs/msg/Vector3Stamped", RELIABLE),
-}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _own_domain(tmp_path_factory: pytest.TempPathFactory) -> None:
-    isolate(tmp_path_factory.mktemp("ros_log"))
-
-
-@pytest.fixture
-def peer(_own_domain: None) -> Iterator[Peer]:
-    made = Peer()
-    yield made
-    made.close()
-
-
 StartNode = Callable[..., NodeProcess]
-
-
-@pytest.fixture
-def start(tmp_path: Path) -> Iterator[StartNode]:
-    """Start a node by name, with arguments; it is killed at the end, if it has not ended."""
-    started: list[NodeProcess] = []
-
-    def start_node(name: str, *arguments: str | Path) -> NodeProcess:
-        folder = tmp_path / f"process{len(started)}"
-        folder.mkdir()
-        started.append(NodeProcess(name, folder, *arguments))
-        return started[-1]
-
-    yield start_node
-    for process in started:
-        process.kill()
-
-
-class Subgoals:
-    """A subgoal node in a process, and all that it says."""
-
-    def __init__(self, process: NodeProcess, peer: Peer) -> None:
-        self.process, self.peer = process, peer
-        self.outputs = {
-            topic: peer.listen(message_class(kind), f"/{topic}") for topic, kind in OUTPUTS.items()
-        }
-        self._diagnostics = peer.listen(diagnostic_msgs.DiagnosticArray, "/diagnostics", 10)
-        self._publishers = {
-            name: peer.publisher(message_class(kind), f"/{name}", qos)
-            for name, (kind, qos) in INPUTS.items()
-        }
-        peer.let_them_find_us()
-
-    def send(self, *groups: list[TopicMessage]) -> None:
-        """Publish messages, in their order; they arrive all, but later."""
-        for name, view, _ in chain(*groups):
-            self._publishers[name].publish(to_ros(view))
-
-    def call(self, service: str, request: Any = None) -> Any:
-        kind = services.SetBool if service == "pause" else services.Trigger
-        return self.peer.call(kind, f"/subgoal_node/{service}", request)
-
-    def health(self) -> dict[str, str]:
-        """The newest diagnostics; empty before the first."""
-        if not self._diagnostics:
-            return {}
-        (status,) = self._diagnostics[-1].status
-        return {
-            **{each.key: each.value for each in status.values},
-            "level": int.from_bytes(status.level),
-            "message": status.message,
-        }
-
-    def until_health(self, what: str, **wanted: str) -> dict[str, str]:
-        """Wait for diagnostics that say so."""
-
-        def is_so() -> bool:
-            health = self.health()
-            return all(health.get(key.replace("_", " ")) == value for key, value in wanted.items())
-
-        self.peer.until(is_so, lambda: f"{what}, {wanted}; says {self.health()}")
-        return self.health()
-
-    def until_fault(self, words: str, count: int) -> None:
-        """Wait until a fault with these words was counted so often."""
-        self.peer.until(
-            lambda: any(
-                key.startswith("left out: ") and words in key and value == str(count)
-                for key, value in self.health().items()
-            ),
-            lambda: f"{count} x {words}; says {self.health()}",
-        )
-
-    def until_settled(self, observations: int) -> dict[str, str]:
-        """Wait until all is taken in and inference has come to its end."""
-        return self.until_health(
-            "rest", state="settled", queue="0", observations=str(observations)
-        )
-
-    def shown(self) -> dict[int, tuple[float, float]]:
-        """Place of each subgoal shown, by its rank."""
-        return {
-            marker.id: (marker.pose.position.x, marker.pose.position.y)
-            for marker in self.outputs["subgoals"][-1].markers
-            if marker.ns == "subgoal"
-        }
-
-    def until_shown(self, places: set[tuple[float, float]]) -> None:
-        """Wait until exactly these subgoals are shown."""
-        outputs = self.outputs["subgoals"]
-        self.peer.until(
-            lambda: outputs and set(self.shown().values()) == places, f"subgoals at {places}"
-        )
-
-    def set(self, **values: Any) -> list[Any]:
-        """Set parameters, one after the other; returns the results."""
-        request = parameter_services.SetParameters.Request()
-        request.parameters = [
-            rclpy_parameter.Parameter(name, value=value).to_parameter_msg()
-            for name, value in values.items()
-        ]
-        kind = parameter_services.SetParameters
-        return self.peer.call(kind, "/subgoal_node/set_parameters", request).results
-
-
-@pytest.fixture
-def subgoals(start: StartNode, peer: Peer) -> Callable[..., Subgoals]:
-    """Start a subgoal node with parameters."""
-
-    def start_it(**parameters: Any) -> Subgoals:
-        return Subgoals(start("subgoal_node", *as_arguments(parameters)), peer)
-
-    return start_it
-
-
-def as_arguments(parameters: Mapping[str, Any]) -> list[str]:
-    words = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
-    return ["--ros-args", *words] if words else []
+QUICK = {"sweeps": 300, "burn_in": 100}
 
 
 def centres(cells: Any, grid_map: GridMap = MAP) -> set[tuple[float, float]]:
@@ -215,13 +86,6 @@ def centres(cells: Any, grid_map: GridMap = MAP) -> set[tuple[float, float]]:
 
 
 CORNER_PLACES = centres(CORNERS)
-
-
-def assert_silent_end(process: NodeProcess, number: signal.Signals) -> None:
-    end = process.end(number)
-    assert end.status == 0, end
-    assert "Traceback" not in end.err
-    assert "Error" not in end.err
 
 
 # The same posterior, live and offline
@@ -470,7 +334,8 @@ def test_who_comes_late_gets_all_outputs(subgoals: Callable[..., Subgoals], peer
     peer.rest(1.5)  # the last assignments may come a second after the last subgoals
     assert len(node.outputs["assignments"][-1].markers) == 5
     late = {
-        topic: peer.listen(message_class(kind), f"/{topic}") for topic, kind in OUTPUTS.items()
+        topic.name: peer.listen(message_class(topic.type_name), f"/{topic.name}")
+        for topic in OUTPUTS
     }
     peer.until(lambda: all(late.values()), "the last message on each topic")
     for topic, received in late.items():
@@ -650,7 +515,7 @@ def test_callbacks_are_served_while_inference_runs(
 
 def test_parameters_are_described(subgoals: Callable[..., Subgoals]) -> None:
     node = subgoals()
-    table = [*map(parameter_of, fields(Settings)), *PARAMETERS]
+    table = [AUTOSTART, *map(parameter_of, fields(Settings)), *PARAMETERS]
     expected = {entry.name: entry.limits for entry in table}
     defaults = {entry.name: entry.default for entry in table}
     names = list(expected)
@@ -661,7 +526,7 @@ def test_parameters_are_described(subgoals: Callable[..., Subgoals]) -> None:
     kind = parameter_services.GetParameters
     request = kind.Request(names=names)
     values = node.peer.call(kind, "/subgoal_node/get_parameters", request).values
-    types = {int: 2, float: 3, str: 4}
+    types = {bool: 1, int: 2, float: 3, str: 4}
     for name, each, value in zip(names, told, values, strict=True):
         limits = expected[name]
         assert each.name == name
@@ -670,12 +535,12 @@ def test_parameters_are_described(subgoals: Callable[..., Subgoals]) -> None:
         assert rclpy_parameter.parameter_value_to_python(value) == defaults[name]
         if limits.choices:
             assert all(str(choice) in each.additional_constraints for choice in limits.choices)
-        elif each.type != 4:
+        elif each.type in (2, 3):
             (bounds,) = each.integer_range or each.floating_point_range
             assert bounds.from_value == max(limits.lowest, limits.above)
             assert bounds.to_value == min(limits.highest, limits.below, bounds.to_value)
             assert each.additional_constraints == limits.range_in_words()
-        assert each.read_only == (name in {entry.name for entry in PARAMETERS})
+        assert each.read_only == (name == AUTOSTART.name)
 
 
 def test_parameters_can_be_set_and_bad_values_are_refused_with_a_reason(
@@ -692,11 +557,12 @@ def test_parameters_can_be_set_and_bad_values_are_refused_with_a_reason(
         "model": ("none", "model must be one of sequential, paper"),
         "discount": (math.nan, "discount"),
         "seed": ("text", "expected 'Type.INTEGER' got 'Type.STRING'"),
-        "queue_depth": (1, "read-only"),
-        "waiting_limit": (1, "read-only"),
-        "episode_gap": (1.0, "read-only"),
-        "waypoints_file": ("elsewhere", "read-only"),
-        "result_folder": ("elsewhere", "read-only"),
+        "autostart": (False, "read-only"),
+        "queue_depth": (1, "is taken when the node is configured; deactivate it and clean it up"),
+        "waiting_limit": (1, "waiting_limit is taken when"),
+        "episode_gap": (1.0, "episode_gap is taken when"),
+        "waypoints_file": ("elsewhere", "waypoints_file is taken when"),
+        "result_folder": ("elsewhere", "result_folder is taken when"),
     }
     results = node.set(**{name: value for name, (value, _) in refused.items()})
     for result, (name, (_, reason)) in zip(results, refused.items(), strict=True):
@@ -756,10 +622,13 @@ class Audience:
     """Whoever listens to a replay, and when it heard what."""
 
     def __init__(self, peer: Peer) -> None:
-        self.heard: dict[str, list[tuple[float, Any]]] = {name: [] for name in INPUTS}
-        for name, (kind, qos) in INPUTS.items():
+        self.heard: dict[str, list[tuple[float, Any]]] = {topic.name: [] for topic in INPUTS}
+        for topic in INPUTS:
             peer.node.create_subscription(
-                message_class(kind), f"/{name}", partial(self._hear, name), qos
+                message_class(topic.type_name),
+                f"/{topic.name}",
+                partial(self._hear, topic.name),
+                LATCHED if topic.latched else RELIABLE,
             )
 
     def _hear(self, name: str, message: Any) -> None:
@@ -784,14 +653,14 @@ def test_a_replay_waits_loses_nothing_and_says_what_it_sent(
         name: peer.until(
             lambda name=name: peer.node.get_publishers_info_by_topic(f"/{name}"), f"/{name}"
         )
-        for name in INPUTS
+        for name in TOPIC_TYPES
     }
     assert process.running
 
     audience = Audience(peer)
-    expected = {name: sum(each == name for each, _, _ in sent) for name in INPUTS}
+    expected = {name: sum(each == name for each, _, _ in sent) for name in TOPIC_TYPES}
     peer.until(lambda: audience.counts() == expected, lambda: str(audience.counts()))
-    for name in INPUTS:
+    for name in TOPIC_TYPES:
         assert audience.stamps(name) == [stamp for each, _, stamp in sent if each == name]
     end = process.end()
     assert end.status == 0

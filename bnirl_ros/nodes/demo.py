@@ -31,7 +31,7 @@ from bnirl_ros.views.tables import subgoal_table
 
 _RECORDED = {
     **{f"/{name}": type_name for name, type_name in TOPIC_TYPES.items()},
-    **{f"/{name}": type_name for name, type_name in OUTPUTS.items()},
+    **{f"/{topic.name}": topic.type_name for topic in OUTPUTS},
     "/diagnostics": DiagnosticArray.TYPE,
 }
 _PASSING = ("/pose", "/action", "/diagnostics")  # the others are latched

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import Field, dataclass, fields, replace
+from enum import Enum
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -28,31 +29,39 @@ INFERRED = -1.0
 """Value of a parameter of the model that is not given: ROS has none for nothing."""
 
 
+class Changeable(Enum):
+    """When a parameter can be changed, in words for the reference."""
+
+    NEVER = "at the start only"
+    UNCONFIGURED = "while unconfigured"
+    ALWAYS = "at any time"
+
+
 @dataclass(frozen=True)
 class NodeParameter:
-    """A parameter that is the node's own, not the inference's.
+    """A parameter of a node.
 
     Attributes:
         name: its name.
         default: its value where none is given; also fixes its type.
         limits: description and range.
-        read_only: whether it can be given at the start only.
+        changeable: when it can be changed; most are taken when the node is configured.
     """
 
     name: str
     default: Any
     limits: Limits
-    read_only: bool = True
+    changeable: Changeable = Changeable.UNCONFIGURED
 
 
-def parameter_of(setting: Field[Any]) -> NodeParameter:
+def parameter_of(setting: Field[Any], changeable: Changeable = Changeable.ALWAYS) -> NodeParameter:
     """A parameter for a setting; one of the model that may be inferred has a value for that."""
     limits = limits_of(setting)
     if setting.default is not None:
-        return NodeParameter(setting.name, setting.default, limits, read_only=False)
+        return NodeParameter(setting.name, setting.default, limits, changeable)
     described = f"{limits.description}; {INFERRED:g}: not given"
     limits = replace(limits, description=described, lowest=INFERRED, above=-math.inf)
-    return NodeParameter(setting.name, INFERRED, limits, read_only=False)
+    return NodeParameter(setting.name, INFERRED, limits, changeable)
 
 
 def declare(node: Node, table: Sequence[NodeParameter]) -> dict[str, Any]:
@@ -137,7 +146,7 @@ def _descriptor(entry: NodeParameter) -> ParameterDescriptor:
             if limits.choices
             else limits.range_in_words()
         ),
-        read_only=entry.read_only,
+        read_only=entry.changeable is Changeable.NEVER,
     )
     lowest, highest = max(limits.lowest, limits.above), min(limits.highest, limits.below)
     if isinstance(entry.default, float) and math.isfinite(max(lowest, -highest)):

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import sys
+import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError
 from pathlib import Path
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.qos import QoSProfile
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
@@ -23,15 +21,16 @@ from bnirl_ros.demonstrations.placement import EPISODE_GAP, place
 from bnirl_ros.demonstrations.recording import Recorder
 from bnirl_ros.errors import InputError
 from bnirl_ros.inference.background import BackgroundInference, Result
+from bnirl_ros.inference.settings import Settings
 from bnirl_ros.inference.summary import Summary, nothing_found
 from bnirl_ros.inference.watching import BackgroundWatch
 from bnirl_ros.limits import Limits
 from bnirl_ros.maps import FeatureLayer, GridMap, load_features, with_features
-from bnirl_ros.nodes.conversion import message_class, to_ros
-from bnirl_ros.nodes.parameters import NodeParameter, declare, declare_settings
-from bnirl_ros.nodes.process import run, spin
+from bnirl_ros.nodes.managed import LATCHED, ManagedNode, publish, serve
+from bnirl_ros.nodes.parameters import NodeParameter, declare_settings
+from bnirl_ros.nodes.topics import NodeService, NodeTopic
 from bnirl_ros.views.belief import belief_grid
-from bnirl_ros.views.diagnostics import Health, diagnostic_array
+from bnirl_ros.views.diagnostics import Health, inference_values
 from bnirl_ros.views.intent import current_subgoal, intent_markers, no_intent
 from bnirl_ros.views.markers import assignment_markers, subgoal_markers
 from bnirl_ros.views.messages import MarkerArray, Message, OccupancyGrid, PoseStamped
@@ -74,91 +73,173 @@ PARAMETERS = (
 )
 """The node's own parameters; those of the inference are in `bnirl_ros.inference.settings`."""
 
-OUTPUTS = {
-    "subgoals": MarkerArray.TYPE,
-    "assignments": MarkerArray.TYPE,
-    "waypoints": PathMessage.TYPE,
-    "subgoal_belief": OccupancyGrid.TYPE,
-    "current_subgoal": PoseStamped.TYPE,
-    "intent": MarkerArray.TYPE,
-}
-"""Message type of each topic that shows the posterior, or what is pursued now; all latched."""
+INPUTS = (
+    NodeTopic(
+        "pose",
+        TOPIC_TYPES["pose"],
+        "centre of the demonstrator's cell, in the map frame",
+        latched=False,
+    ),
+    NodeTopic(
+        "action",
+        TOPIC_TYPES["action"],
+        "unit step (dx, dy) along the map's axes, each -1, 0 or 1; (0, 0) is stay; stamped as the "
+        "pose in which it was chosen",
+        latched=False,
+    ),
+    NodeTopic("map", TOPIC_TYPES["map"], "0-49 is free, 50-100 and unknown are blocked"),
+)
+"""What is heard."""
+
+OUTPUTS = (
+    NodeTopic(
+        "subgoals",
+        MarkerArray.TYPE,
+        "sphere, arrow and label of each subgoal, with its rank as id",
+    ),
+    NodeTopic(
+        "assignments",
+        MarkerArray.TYPE,
+        "the actions that belong to each subgoal, in its colour; those that none explains, in "
+        "grey; once a second at most",
+    ),
+    NodeTopic(
+        "waypoints",
+        PathMessage.TYPE,
+        "the subgoals in the order visited, each heading for the next",
+    ),
+    NodeTopic(
+        "subgoal_belief", OccupancyGrid.TYPE, "probability, 0-100, that a cell is a subgoal"
+    ),
+    NodeTopic(
+        "current_subgoal",
+        PoseStamped.TYPE,
+        "the subgoal that is most probably pursued now, as its waypoint; stamped as the "
+        "demonstrator's latest pose",
+    ),
+    NodeTopic(
+        "intent",
+        MarkerArray.TYPE,
+        "an arrow from the demonstrator to each subgoal that may be pursued now, its rank as id "
+        "and its probability as opacity, and a label with both; the label of id 0 tells how "
+        "probably it is none of them",
+    ),
+)
+"""What shows the posterior, or what is pursued now."""
+
+SERVICES = (
+    NodeService(
+        "~/infer",
+        "std_srvs/srv/Trigger",
+        "infer afresh from all that was observed, exactly as `bnirl infer` does",
+    ),
+    NodeService("~/reset", "std_srvs/srv/Trigger", "forget all observations"),
+    NodeService("~/pause", "std_srvs/srv/SetBool", "stop and go on inferring"),
+)
+"""What it can be asked to do while it is active."""
 
 View = Callable[[Summary, GridMap, int], Message]
 """Shows a summary on a map, in a message with this stamp [ns]."""
 
 _LOOK_PERIOD = 0.1  # [s] between two looks at whether there is a result
 _ASSIGNMENTS_PERIOD = 1.0  # [s] at the least between two messages on `assignments`
-_LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-class SubgoalNode(Node):
+class SubgoalNode(ManagedNode):
     """Takes in poses, actions and maps, and publishes the subgoals that explain them.
 
-    Topics, services and parameters are those of the README. Callbacks only record; a thread of
-    its own infers, another one tells what is pursued now, and a timer publishes what they found.
+    Callbacks only record; a thread of its own infers, another one tells what is pursued now, and a
+    timer publishes what they found.
     """
 
     def __init__(self) -> None:
-        """Declare everything, and begin to listen.
+        """Declare parameters and services.
 
         Raises:
-            InputError: a parameter was given a value that it cannot have, or names a file that
-                cannot be used.
+            InputError: a parameter was given a value that it cannot have.
         """
-        super().__init__("subgoal_node")
-        own = declare(self, PARAMETERS)
-        settings = declare_settings(self, lambda changed: self._inference.use_settings(changed))
-        self._result_folder: str = own["result_folder"]
-        self._features: FeatureLayer | None = None
-        if own["features"]:
-            self._features = load_features(Path(own["features"]).expanduser())
-        self._saved_waypoints: Waypoints | None = None
-        if own["waypoints_file"]:
-            self._saved_waypoints = read_waypoints(Path(own["waypoints_file"]).expanduser())
-        self._recorder = Recorder(own["waiting_limit"])
-        self._inference = BackgroundInference(self._recorder, settings, own["episode_gap"])
-        self._watch = BackgroundWatch(self._recorder, own["episode_gap"])
-        self._shown: dict[str, Message] = {}  # the last messages on what is pursued now
-        self._faults: Counter[str] = Counter()
-        self._result: Result | None = None
-        self._assignments_due = False
-        self._assignments_at = 0
+        super().__init__("subgoal_node", "inference", PARAMETERS)
+        self._settings = declare_settings(self, self._use_settings)
         self._answers: list[tuple[Any, Future]] = []
-
-        demonstration_qos = QoSProfile(depth=own["queue_depth"])
-        for name, callback, qos in (
-            ("pose", self._on_pose, demonstration_qos),
-            ("action", self._on_action, demonstration_qos),
-            ("map", self._on_map, _LATCHED),
-        ):
-            self.create_subscription(
-                message_class(TOPIC_TYPES[name]),
-                name,
-                callback,
-                qos,
-                event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost),
-                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-            )
-        self._outputs = {
-            name: self.create_publisher(message_class(type_name), name, _LATCHED)
-            for name, type_name in OUTPUTS.items()
-        }
-        self._send_saved_waypoints()
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         # In a group of its own: in the node's, everything else would wait until it is answered.
         answered_later = ReentrantCallbackGroup()
         self.create_service(Trigger, "~/infer", self._on_infer, callback_group=answered_later)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
-        self.create_timer(_LOOK_PERIOD, self._look)
-        self.create_timer(1.0, self._publish_diagnostics)
+        self.every(_LOOK_PERIOD, self._look)
 
-    def close(self) -> None:
-        """End the inference and the watch, then the node."""
+    def configure(self, values: dict[str, Any]) -> None:
+        """Read the files that parameters name, and start the two threads."""
+        self._depth: int = values["queue_depth"]
+        self._result_folder: str = values["result_folder"]
+        self._features: FeatureLayer | None = None
+        if values["features"]:
+            self._features = load_features(Path(values["features"]).expanduser())
+        self._saved_waypoints: Waypoints | None = None
+        if values["waypoints_file"]:
+            self._saved_waypoints = read_waypoints(Path(values["waypoints_file"]).expanduser())
+        self._outputs = self.advertise(OUTPUTS)
+        self._recorder = Recorder(values["waiting_limit"])
+        self._shown: dict[str, Message] = {}  # the last messages on what is pursued now
+        self._result: Result | None = None
+        self._assignments_due = False
+        self._assignments_at = -math.inf  # [s] by the machine's own time
+        self._paused = False
+        gap = values["episode_gap"]
+        self._inference = BackgroundInference(self._recorder, self._settings, gap)
+        self._watch = BackgroundWatch(self._recorder, gap)
+
+    def activate(self) -> None:
+        """Hear, infer, and publish what was found before."""
+        self._inference.pause(self._paused)
+        self._send_saved_waypoints()
+        if self._result:
+            self._publish(self._result)
+        by_name = {"pose": self._on_pose, "action": self._on_action, "map": self._on_map}
+        for topic in INPUTS:
+            qos = LATCHED if topic.latched else QoSProfile(depth=self._depth)
+            self.hear(topic.name, topic.type_name, by_name[topic.name], qos)
+
+    def deactivate(self) -> None:
+        """Let the inference rest."""
+        self._inference.pause(True)
+
+    def clean_up(self) -> None:
+        """End the threads, and answer who waits for an inference."""
         self._inference.close()
         self._watch.close()
-        self.destroy_node()
+        self._answer()
+
+    def health(self) -> Health:
+        """How the inference gets on, and what was left out."""
+        self._look()  # whoever reads "settled" has the last result
+        result = self._result
+        summary = result.summary if result else None
+        observations = len(result.placement.demonstration) if result else 0
+        idle = self._inference.idle and self._watch.idle
+        return Health(
+            subject="inference",
+            state="paused" if self._paused else "settled" if idle else "inferring",
+            message=f"{len(summary.subgoals)} subgoals from {observations} observations"
+            if summary
+            else "waiting for a map and observations",
+            values=inference_values(
+                summary,
+                observations,
+                result.sweeps if result else 0,
+                len(self._recorder) - (result.placement.messages if result else 0),
+            ),
+            faults=self._recorder.faults
+            + self.faults
+            + (result.placement.faults if result else Counter()),
+            error=self._inference.error or self._watch.error,
+            last_error=self._inference.last_error or self._watch.last_error,
+        )
+
+    def _use_settings(self, settings: Settings) -> None:
+        self._settings = settings
+        if self.configured:
+            self._inference.use_settings(settings)
 
     def _on_pose(self, message: Any) -> None:
         self._taken(take_pose(self._recorder, message))
@@ -168,7 +249,7 @@ class SubgoalNode(Node):
 
     def _taken(self, fault: str | None) -> None:
         if fault:
-            self._log_fault(fault, self._recorder.faults[fault])
+            self.tell(fault, self._recorder.faults[fault])
         else:
             self._inference.observations_arrived()
             self._watch.observations_arrived()
@@ -179,22 +260,14 @@ class SubgoalNode(Node):
             if self._features:
                 grid_map = with_features(grid_map, self._features)
         except InputError as error:
-            fault = str(error)
-            self._faults[fault] += 1
-            self._log_fault(fault, self._faults[fault])
+            self.count(str(error))
             return
         self._recorder.map_arrived()
         self._inference.use_map(grid_map)
 
-    def _on_lost(self, event: Any) -> None:
-        self._faults["message lost on its way"] += event.total_count_change
-
-    def _log_fault(self, fault: str, count: int) -> None:
-        """Tell of the first one, the tenth, the hundredth...: no flood, and no silence."""
-        if str(count).strip("0") == "1":
-            self.get_logger().warning(f"left out {count} x {fault}")
-
     async def _on_infer(self, _: Any, response: Any) -> Any:
+        if self._is_refused(response):
+            return response
         request = self._inference.infer(self._keep)
         done: Future = Future()
         self._answers.append((request, done))
@@ -234,8 +307,10 @@ class SubgoalNode(Node):
         )
 
     def _on_reset(self, _: Any, response: Any) -> Any:
+        if self._is_refused(response):
+            return response
         self._recorder.clear()
-        self._faults.clear()
+        self.faults.clear()
         self._inference.reset()
         if self._result:
             grid_map = self._result.grid_map
@@ -245,17 +320,27 @@ class SubgoalNode(Node):
         return response
 
     def _on_pause(self, request: Any, response: Any) -> Any:
-        self._inference.pause(request.data)
+        if self._is_refused(response):
+            return response
+        self._paused = request.data
+        self._inference.pause(self._paused)
         response.success = True
         response.message = "inference rests" if request.data else "inference goes on"
         return response
 
+    def _is_refused(self, response: Any) -> bool:
+        """Whether a service cannot be given now; the response tells why."""
+        if self.active:
+            return False
+        response.success = False
+        response.message = f"{self.get_name()} is not active; activate it first"
+        return True
+
     def _look(self) -> None:
         """Answer whoever waits for an inference, and publish what is new."""
-        for request, done in self._answers:
-            if request.done():
-                done.set_result(None)
-        self._answers = [(request, done) for request, done in self._answers if not done.done()]
+        self._answer()
+        if not self.active:
+            return
         result = self._inference.take_result()
         if result is not None:
             self._publish(result)
@@ -263,79 +348,54 @@ class SubgoalNode(Node):
         if told is not None:
             self._show("current_subgoal", current_subgoal(*told))
             self._show("intent", intent_markers(*told))
-        now = self.get_clock().now().nanoseconds
-        since = now - self._assignments_at
-        if self._assignments_due and not 0 <= since < _ASSIGNMENTS_PERIOD * 1e9:
+        now = time.monotonic()
+        if self._assignments_due and now - self._assignments_at > _ASSIGNMENTS_PERIOD:
             assert self._result is not None
-            self._send("assignments", assignment_markers, self._result, now)
+            self._send("assignments", assignment_markers, self._result)
             self._assignments_due, self._assignments_at = False, now
+
+    def _answer(self) -> None:
+        """Answer the requests for an inference that is done, or will not be."""
+        for request, done in self._answers:
+            if request.done():
+                done.set_result(None)
+        self._answers = [(request, done) for request, done in self._answers if not done.done()]
 
     def _publish(self, result: Result) -> None:
         self._result = result
-        now = self.get_clock().now().nanoseconds
-        self._send("subgoals", subgoal_markers, result, now)
+        self._send("subgoals", subgoal_markers, result)
         if result.summary or not self._saved_waypoints:
-            self._send("waypoints", waypoint_path, result, now)
+            self._send("waypoints", waypoint_path, result)
         else:
             self._send_saved_waypoints()
-        self._send("subgoal_belief", belief_grid, result, now)
+        self._send("subgoal_belief", belief_grid, result)
         self._assignments_due = True
         self._watch.use(result.intent_filter)
         if result.intent_filter is None and self._shown:
             self._shown.clear()
-            self._outputs["intent"].publish(to_ros(no_intent(result.grid_map, now)))
+            publish(self._outputs["intent"], no_intent(result.grid_map, self.stamp()))
 
     def _show(self, name: str, view: Message | None) -> None:
         """Publish what is pursued now, unless that is what was published last."""
         if view is not None and view != self._shown.get(name):
             self._shown[name] = view
-            self._outputs[name].publish(to_ros(view))
+            publish(self._outputs[name], view)
 
-    def _send(self, name: str, view: View, result: Result, stamp: int) -> None:
+    def _send(self, name: str, view: View, result: Result) -> None:
         summary = result.summary or nothing_found(result.grid_map)
-        self._outputs[name].publish(to_ros(view(summary, result.grid_map, stamp)))
+        publish(self._outputs[name], view(summary, result.grid_map, self.stamp()))
 
     def _send_saved_waypoints(self) -> None:
         """Publish the waypoints of a file, if one was given: they stand in for a posterior."""
         if self._saved_waypoints:
-            path = path_of(self._saved_waypoints, self.get_clock().now().nanoseconds)
-            self._outputs["waypoints"].publish(to_ros(path))
-
-    def _publish_diagnostics(self) -> None:
-        self._look()  # whoever reads "settled" has the last result
-        result = self._result
-        faults = self._recorder.faults + self._faults
-        if result:
-            faults = faults + result.placement.faults
-        health = Health(
-            name=self.get_fully_qualified_name().lstrip("/"),
-            paused=self._inference.paused,
-            idle=self._inference.idle and self._watch.idle,
-            observations=len(result.placement.demonstration) if result else 0,
-            waiting=len(self._recorder) - (result.placement.messages if result else 0),
-            sweeps=result.sweeps if result else 0,
-            summary=result.summary if result else None,
-            faults=faults,
-            error=self._inference.error or self._watch.error,
-            last_error=self._inference.last_error or self._watch.last_error,
-        )
-        view = diagnostic_array(health, self.get_clock().now().nanoseconds)
-        self._diagnostics.publish(to_ros(view))
+            publish(self._outputs["waypoints"], path_of(self._saved_waypoints, self.stamp()))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the node until it is stopped; returns the exit status."""
     # Numpy holds the interpreter for up to its switch interval while a callback waits.
     sys.setswitchinterval(0.0005)
-
-    def body() -> None:
-        node = SubgoalNode()
-        try:
-            spin(node)
-        finally:
-            node.close()
-
-    return run("subgoal_node", body, arguments)
+    return serve("subgoal_node", SubgoalNode, arguments)
 
 
 if __name__ == "__main__":

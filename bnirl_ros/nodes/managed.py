@@ -1,0 +1,289 @@
+"""What our managed nodes have in common: life cycle, topics, counting and diagnostics."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+
+from bnirl_ros.errors import InputError
+from bnirl_ros.limits import Limits
+from bnirl_ros.nodes.conversion import message_class, to_ros
+from bnirl_ros.nodes.parameters import Changeable, NodeParameter, declare
+from bnirl_ros.nodes.process import run, spin
+from bnirl_ros.nodes.topics import NodeTopic
+from bnirl_ros.views.diagnostics import Health, diagnostic_array
+from bnirl_ros.views.messages import DiagnosticArray, Message
+
+AUTOSTART = NodeParameter(
+    "autostart",
+    True,
+    Limits(
+        "whether the node configures and activates itself; false where somebody else does, such "
+        "as Nav2's lifecycle manager"
+    ),
+    Changeable.NEVER,
+)
+"""The parameter that all managed nodes have."""
+
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+"""The last message is kept for whoever comes late."""
+
+_DIAGNOSTICS_PERIOD = 1.0  # [s]
+
+
+class ManagedNode(LifecycleNode):
+    """A lifecycle node that hears its topics, and publishes, only while it is active.
+
+    Its parameters are declared when it is made, and taken when it is configured. A subclass says
+    in `configure`, `activate`, `deactivate` and `clean_up` what each transition does.
+
+    Attributes:
+        configured: whether it is, be it active or not.
+        active: whether it is.
+        faults: how often each fault occurred among the messages that are left out.
+    """
+
+    def __init__(self, name: str, subject: str, table: Sequence[NodeParameter]) -> None:
+        """Declare the parameters of a table and `autostart`.
+
+        Args:
+            name: of the node, unless it is remapped.
+            subject: what its diagnostics are about, in a word.
+            table: its parameters; those of an inference are declared besides.
+
+        Raises:
+            InputError: a parameter was given a value that it cannot have.
+        """
+        super().__init__(name)
+        self.active = False
+        self.faults: Counter[str] = Counter()
+        self.configured = False
+        self._failure = ""  # why the last transition was not made
+        self._heard: list[Any] = []
+        self._advertised: list[Any] = []
+        self._taken_when_configured = {
+            entry.name for entry in table if entry.changeable is Changeable.UNCONFIGURED
+        }
+        self._table = table
+        self._subject = subject
+        declare(self, (AUTOSTART, *table))
+        self.add_on_set_parameters_callback(self._refuse_late_changes)
+        self._diagnostics = self.create_publisher(
+            message_class(DiagnosticArray.TYPE), "/diagnostics", 10
+        )
+        self.every(_DIAGNOSTICS_PERIOD, self._publish_diagnostics)
+
+    def configure(self, values: dict[str, Any]) -> None:
+        """Prepare all that the node needs, with these values of the table's parameters.
+
+        Raises:
+            InputError: they cannot be used, and nothing was prepared; the node stays unconfigured.
+        """
+        raise NotImplementedError
+
+    def activate(self) -> None:
+        """Begin to hear and to publish."""
+        raise NotImplementedError
+
+    def deactivate(self) -> None:
+        """Stop working; what was heard so far is kept. Topics are not heard any more."""
+
+    def clean_up(self) -> None:
+        """Let go of all that `configure` prepared."""
+        raise NotImplementedError
+
+    def health(self) -> Health:
+        """How the node is."""
+        raise NotImplementedError
+
+    def start(self) -> None:
+        """Configure and activate the node, unless somebody else is to do so.
+
+        Raises:
+            InputError: it cannot be configured.
+        """
+        if not self.get_parameter(AUTOSTART.name).value:
+            return
+        for trigger in (self.trigger_configure, self.trigger_activate):
+            if trigger() is not TransitionCallbackReturn.SUCCESS:
+                raise InputError(self._failure)
+
+    def close(self) -> None:
+        """Let go of everything, in whatever state the node is."""
+        self._end()
+        self.destroy_node()
+
+    def every(self, period: float, callback: Callable[[], None]) -> Any:
+        """A timer [s] of the machine's own time: simulated time may stand still."""
+        return self.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def advertise(self, topics: Iterable[NodeTopic], depth: int = 10) -> dict[str, Any]:
+        """Publishers of topics by their names, until the node is cleaned up.
+
+        Args:
+            topics: the topics.
+            depth: messages of each that are kept for slow subscribers; of a latched one it is 1.
+        """
+        publishers = {
+            topic.name: self.create_lifecycle_publisher(
+                message_class(topic.type_name),
+                topic.name,
+                LATCHED if topic.latched else QoSProfile(depth=depth),
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )
+            for topic in topics
+        }
+        self._advertised += publishers.values()
+        return publishers
+
+    def hear(
+        self, topic: str, type_name: str, callback: Callable[[Any], None], qos: QoSProfile
+    ) -> None:
+        """Hear a topic until the node is deactivated; lost messages are counted."""
+        self._heard.append(
+            self.create_subscription(
+                message_class(type_name),
+                topic,
+                callback,
+                qos,
+                event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost),
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )
+        )
+
+    def count(self, fault: str) -> None:
+        """Count a fault of the node's own, and tell of it."""
+        self.faults[fault] += 1
+        self.tell(fault, self.faults[fault])
+
+    def tell(self, fault: str, count: int) -> None:
+        """Tell of the first one, the tenth, the hundredth...: no flood, and no silence."""
+        if str(count).strip("0") == "1":
+            self.get_logger().warning(f"left out {count} x {fault}")
+
+    def stamp(self) -> int:
+        """Now [ns], by the node's clock."""
+        return int(self.get_clock().now().nanoseconds)
+
+    # What rclpy calls. It swallows exceptions, and takes the return value for what happened.
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Configure the node; it stays unconfigured where that cannot be done."""
+        values = {entry.name: self.get_parameter(entry.name).value for entry in self._table}
+        outcome = self._tried("configured", lambda: self.configure(values))
+        self.configured = outcome is TransitionCallbackReturn.SUCCESS
+        return super().on_configure(state) if self.configured else outcome
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Activate the node: publishers first, then what publishes."""
+        super().on_activate(state)
+        self.active = True
+        outcome = self._tried("activated", self.activate)
+        if outcome is not TransitionCallbackReturn.SUCCESS:
+            self._be_deaf()
+        return outcome
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Deactivate the node."""
+        self._be_deaf()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Clean the node up; it can be configured anew."""
+        self._end()
+        return super().on_cleanup(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """End the node's work for good."""
+        self._end()
+        return super().on_shutdown(state)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """After a fault of the program in a transition: as if never configured."""
+        self._end()
+        return super().on_error(state)
+
+    def _tried(self, done: str, transition: Callable[[], None]) -> TransitionCallbackReturn:
+        """What came of a part of a transition; a fault is logged unless `start` tells of it."""
+        try:
+            transition()
+        except InputError as error:
+            self._failure = str(error)
+            if not self.get_parameter(AUTOSTART.name).value:
+                self.get_logger().error(f"cannot be {done}: {error}")
+            return TransitionCallbackReturn.FAILURE
+        except Exception as error:
+            self._failure = f"cannot be {done}: {type(error).__name__}: {error}"
+            self.get_logger().error(self._failure)
+            return TransitionCallbackReturn.ERROR
+        return TransitionCallbackReturn.SUCCESS
+
+    def _be_deaf(self) -> None:
+        if self.active:
+            self.active = False
+            for subscription in self._heard:
+                self.destroy_subscription(subscription)
+            self._heard.clear()
+            self.deactivate()
+
+    def _end(self) -> None:
+        self._be_deaf()
+        if self.configured:
+            self.configured = False
+            self.clean_up()
+            for publisher in self._advertised:
+                self.destroy_lifecycle_publisher(publisher)
+            self._advertised.clear()
+            self.faults.clear()
+
+    def _refuse_late_changes(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        late = [each.name for each in parameters if each.name in self._taken_when_configured]
+        if late and self.configured:
+            return SetParametersResult(
+                successful=False,
+                reason=f"{late[0]} is taken when the node is configured; deactivate it and clean "
+                "it up first",
+            )
+        return SetParametersResult(successful=True)
+
+    def _on_lost(self, event: Any) -> None:
+        self.faults["message lost on its way"] += event.total_count_change
+
+    def _publish_diagnostics(self) -> None:
+        if not self.configured:
+            health = Health(self._subject, "unconfigured", "unconfigured")
+        elif not self.active:
+            health = replace(self.health(), state="inactive", message="inactive")
+        else:
+            health = self.health()
+        name = self.get_fully_qualified_name().lstrip("/")
+        publish(self._diagnostics, diagnostic_array(name, health, self.stamp()))
+
+
+def publish(publisher: Any, view: Message) -> None:
+    """Publish what a view says."""
+    publisher.publish(to_ros(view))
+
+
+def serve(name: str, make: Callable[[], ManagedNode], arguments: Sequence[str] | None) -> int:
+    """Run a managed node until it is stopped; returns the exit status."""
+
+    def body() -> None:
+        node = make()
+        try:
+            node.start()
+            spin(node)
+        finally:
+            node.close()
+
+    return run(name, body, arguments)
