@@ -47,15 +47,30 @@ def joined(free: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
     | arrays(np.bool_, (20, 20), elements=st.sampled_from([True] * 9 + [False])),
     ratio=st.sampled_from([2.0, 2.4, 3.0, 5.0]),  # no centre of a finer cell on an edge
     radius=st.sampled_from([0.02, 0.1, 0.15, 0.25]),
+    # Where a planning map before it lies [finer cells].
+    before=st.none() | st.tuples(*[st.integers(-30, 30)] * 2),
 )
 def test_whatever_the_disc_can_drive_to_can_be_driven_to(
-    free: npt.NDArray[np.bool_], ratio: float, radius: float
+    free: npt.NDArray[np.bool_], ratio: float, radius: float, before: tuple[int, int] | None
 ) -> None:
     grid_map = fine(free)
     room = room_for_disc(grid_map, radius)
     assume(room.any())
-    planning = coarsen(grid_map, 0.1 * ratio, radius).grid_map
-    assert (planning.resolution, planning.origin) == (0.1 * ratio, grid_map.origin)
+    if before is None:
+        planning = coarsen(grid_map, 0.1 * ratio, radius).grid_map
+        assert planning.origin == grid_map.origin
+    else:
+        ((x, y),) = grid_map.centres_of([np.array(before) - 0.5]).tolist()
+        earlier = GridMap(SQUARE, 0.1 * ratio, (x, y, 0.3), "plan")
+        planning = coarsen(grid_map, 0.1 * ratio, radius, earlier).grid_map
+        assert coarsen(grid_map, 0.1 * ratio, radius, planning).grid_map.is_same_as(planning)
+        # Its cells are as before, and it begins in the cell in which the finer one does.
+        (corner,) = earlier.coordinates_of([planning.origin[:2]])
+        np.testing.assert_allclose(corner, np.rint(corner), atol=1e-6)
+        (begins,) = planning.coordinates_of([grid_map.origin[:2]])
+        assert (begins > -1e-6).all()
+        assert (begins < 1).all()
+    assert (planning.resolution, planning.origin[2]) == (0.1 * ratio, 0.3)
     assert planning.frame_id == "plan"
     y, x = np.nonzero(room)
     cells = planning.cells_of(grid_map.centres_of(np.column_stack([x, y])))

@@ -26,7 +26,8 @@ class Coarsened:
     """A planning map, and what of the finer one it cannot show.
 
     Attributes:
-        grid_map: the planning map; it has the finer one's origin and frame.
+        grid_map: the planning map; it has the finer one's frame and, unless the cells of a map
+            before it stay, its origin.
         through_walls: pairs of free cells, side by side, that have a wall between them: closing
             either would have closed a passage. A finer resolution has fewer.
     """
@@ -35,7 +36,9 @@ class Coarsened:
     through_walls: int
 
 
-def coarsen(grid_map: GridMap, resolution: float, robot_radius: float) -> Coarsened:
+def coarsen(
+    grid_map: GridMap, resolution: float, robot_radius: float, before: GridMap | None = None
+) -> Coarsened:
     """A map with larger cells on which a robot finds the ways that it has on the finer one.
 
     What is kept, of a disc of the robot's radius that moves without touching a blocked cell: from
@@ -48,13 +51,18 @@ def coarsen(grid_map: GridMap, resolution: float, robot_radius: float) -> Coarse
         grid_map: the finer map; its features are left out.
         resolution: edge of the planning map's cells [m].
         robot_radius: [m].
+        before: the planning map so far, if any: its cells stay where they are, if the new map has
+            such cells in the same frame, turned as it is. So what was seen in the middle of a cell
+            is not seen on an edge when the map has grown.
 
     Raises:
         InputError: the robot fits nowhere.
     """
     if resolution <= grid_map.resolution * (1.0 + 1e-9):
         return Coarsened(grid_map, 0)
-    places = _Places.of(_room_for(grid_map, robot_radius), resolution / grid_map.resolution)
+    ratio = resolution / grid_map.resolution
+    origin, (right, up) = _lattice(grid_map, float(resolution), before)
+    places = _Places.of(_room_for(grid_map, robot_radius), ratio, (right * ratio, up * ratio))
     if not places.cell:
         raise InputError(
             f"the map has no place for a robot with a radius of {robot_radius:g} m; give the "
@@ -64,7 +72,7 @@ def coarsen(grid_map: GridMap, resolution: float, robot_radius: float) -> Coarse
     free = np.zeros(places.shape, dtype=np.bool_)
     x, y = np.array([places.cell[place] for place in places.kept]).T
     free[y, x] = True
-    planning = GridMap(free, float(resolution), grid_map.origin, grid_map.frame_id)
+    planning = GridMap(free, float(resolution), origin, grid_map.frame_id)
     return Coarsened(planning, sum(1 for _ in places.through_walls()) // 2)
 
 
@@ -74,6 +82,24 @@ def with_free(grid_map: GridMap, cells: Iterable[_Cell]) -> GridMap:
     for x, y in cells:
         free[y, x] = True
     return replace(grid_map, free=free)
+
+
+def _lattice(
+    grid_map: GridMap, resolution: float, before: GridMap | None
+) -> tuple[tuple[float, float, float], tuple[float, float]]:
+    """The origin of a planning map, and where on it the finer map's origin is [planning cells]."""
+    origin = grid_map.origin
+    if before is None or (before.frame_id, before.resolution, before.origin[2]) != (
+        grid_map.frame_id,
+        resolution,
+        origin[2],
+    ):
+        return origin, (0.0, 0.0)
+    (along,) = before.coordinates_of([origin[:2]])
+    corner = np.floor(along + 1e-6)  # rounding must not add an empty row
+    ((x, y),) = before.centres_of([corner - 0.5]).tolist()
+    right, up = (along - corner).tolist()
+    return (x, y, origin[2]), (right, up)
 
 
 def _room_for(grid_map: GridMap, robot_radius: float) -> npt.NDArray[np.bool_]:
@@ -110,13 +136,20 @@ class _Places:
     kept: set[int]
 
     @classmethod
-    def of(cls, room: npt.NDArray[np.bool_], ratio: float) -> _Places:
-        """The places in the finer cells with room, so many of which are a planning cell wide."""
+    def of(cls, room: npt.NDArray[np.bool_], ratio: float, shift: tuple[float, float]) -> _Places:
+        """The places in the finer cells with room.
+
+        Args:
+            room: (height, width).
+            ratio: how many of these cells a planning cell is wide.
+            shift: how many of them to the right and up of the planning map's origin they begin.
+        """
         from scipy.ndimage import label
 
         # The planning cell of each row and column is that of its centre.
         rows, columns = (
-            np.floor((np.arange(length) + 0.5) / ratio).astype(np.int64) for length in room.shape
+            np.floor((np.arange(length) + 0.5 + start) / ratio).astype(np.int64)
+            for length, start in zip(room.shape, reversed(shift), strict=True)
         )
         # An empty line between planning cells keeps the parts of one from those of the next.
         apart = np.zeros((len(rows) + rows[-1], len(columns) + columns[-1]), dtype=np.bool_)

@@ -42,6 +42,13 @@ class GridMap:
     frame_id: str = "map"
     features: FeatureMap | None = None
 
+    def is_same_as(self, other: GridMap) -> bool:
+        """Whether another map has the same free space in the same place; features don't count."""
+        return (
+            (self.resolution, self.origin, self.frame_id)
+            == (other.resolution, other.origin, other.frame_id)
+        ) and np.array_equal(self.free, other.free)
+
     def cells_of(self, positions: npt.ArrayLike) -> npt.NDArray[np.int64]:
         """Cells (N, 2) in which the positions (N, 2) [m] lie; they may lie outside the map."""
         # Far positions would overflow int64 (undefined in C); a cell this far is outside any map.
