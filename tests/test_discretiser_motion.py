@@ -64,7 +64,7 @@ def placed(visits: list[Visit], grid_map: GridMap, moves: int = 8) -> Placement:
     recorder = Recorder(0)
     recorder.map_arrived()
     for visit in visits:
-        record(recorder, visit, grid_map)
+        record(recorder, visit, grid_map.frame_id)
     return place(recorder.snapshot(), grid_map, moves, SETTINGS.longest_silence)
 
 
@@ -155,7 +155,12 @@ def test_the_maps_place_in_its_frame_does_not_matter(
         )
         for time, x, y in track
     ]
-    assert visits_of(moved, there, settings)[0] == visits_of(track)[0]
+    visits, here = visits_of(moved, there, settings)[0], visits_of(track)[0]
+    assert [(visit.stamp, visit.cell, visit.led_by) for visit in visits] == [
+        (visit.stamp, visit.cell, visit.led_by) for visit in here
+    ]
+    positions = [visit.position for visit in visits]
+    assert there.cells_of(positions).tolist() == [list(visit.cell) for visit in visits]
 
 
 @given(arrays(np.int64, st.tuples(st.integers(1, 6), st.just(2)), elements=st.integers(-9, 9)))

@@ -59,7 +59,7 @@ def test_a_straight_drive_goes_where_the_robot_is_headed() -> None:
     )
     assert times[0] == 3.0
     assert times[-1] == pytest.approx(4.5)
-    assert np.diff(times).max() <= TICK
+    assert np.diff(times).max() == pytest.approx(TICK)
     middle = np.array([5.0 + np.sqrt(3) / 2, 5.5])
     np.testing.assert_allclose(positions[np.searchsorted(times, 3.5 - 1e-9)], middle)
     # To the right of a robot that is headed 30 degrees to the left.

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -17,9 +17,10 @@ from bnirl_ros.bags.cdr import decode
 from bnirl_ros.bags.demonstration import RecordedDemonstration, absolute
 from bnirl_ros.bags.reader import Bag, Topic
 from bnirl_ros.demonstrations.discretising import Discretising
-from bnirl_ros.demonstrations.frames import TransformBuffer, frame_name
+from bnirl_ros.demonstrations.frames import TransformBuffer, frame_name, moved
 from bnirl_ros.demonstrations.messages import TOPIC_TYPES, map_of, stamp_of
 from bnirl_ros.demonstrations.motion import Discretiser, record
+from bnirl_ros.demonstrations.planning import on_opened, open_space_round, planning_map
 from bnirl_ros.demonstrations.raw_messages import (
     COMMAND_TYPES,
     NO_MOTION,
@@ -30,11 +31,9 @@ from bnirl_ros.demonstrations.raw_messages import (
     pose_of,
 )
 from bnirl_ros.demonstrations.recording import Recorder
-from bnirl_ros.demonstrations.velocity import follow
+from bnirl_ros.demonstrations.velocity import CommandFollower, follow
 from bnirl_ros.errors import InputError
-from bnirl_ros.maps.coarsening import coarsen
 from bnirl_ros.maps.grid_map import GridMap
-from bnirl_ros.maps.occupancy import check_geometry
 
 _SECOND = 1_000_000_000
 
@@ -134,15 +133,13 @@ def read_raw_demonstration(
     reading = _Reading(Bag(path), settings)
     if grid_map is None:
         grid_map = reading.last_map(absolute(map_topic))
-    if grid_map is not None and settings.map_frame:
-        grid_map = replace(grid_map, frame_id=settings.map_frame)
-    frame_id = grid_map.frame_id if grid_map else settings.map_frame or "map"
+    frame_id = settings.map_frame or (grid_map.frame_id if grid_map else "map")
     motion = reading.motion(frame_id)
     intent = absolute(settings.intent) if settings.intent else ""
     commands = list(reading.commands(intent)) if intent else []
 
     if grid_map is None:
-        planning = _open_space(
+        planning = open_space_round(
             motion.poses[:, :2], settings.planning_resolution, frame_id, str(path)
         )
         height, width = planning.free.shape
@@ -152,15 +149,10 @@ def read_raw_demonstration(
         )
     else:
         try:
-            coarsened = coarsen(grid_map, settings.planning_resolution, settings.robot_radius)
+            planning, warning = planning_map(grid_map, settings)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
-        planning = coarsened.grid_map
-        if coarsened.through_walls:
-            reading.warnings.append(
-                f"planning map: {coarsened.through_walls} pairs of free cells have a wall between "
-                "them that cells so large cannot show; take a lower planning resolution"
-            )
+        reading.warnings += [warning] if warning else []
     discretiser, recorder = Discretiser(planning, settings, moves), Recorder()
     recorder.map_arrived()
     heard = 0
@@ -172,10 +164,10 @@ def read_raw_demonstration(
             discretiser.hear(command.forwards, command.left)
             heard += 1
         for visit in discretiser.follow(stamp, *pose):
-            record(recorder, visit, planning)
-    if discretiser.opened:
+            record(recorder, visit, frame_id)
+    if grid_map and discretiser.opened:
         reading.warnings.append(
-            _on_opened(discretiser.opened, planning, motion.poses[:, :2], grid_map)
+            on_opened(discretiser.opened, planning, motion.poses[:, :2], grid_map)
         )
     recording = recorder.snapshot()
     if not len(recording.actions):
@@ -283,7 +275,7 @@ class _Reading:
                 continue
             if frame != frame_name(frame_id):
                 moved_from.append(frame)
-            poses[here] = _moved(matrices, told.points[here], told.headings[here])
+            poses[here] = moved(matrices, told.points[here], told.headings[here])
             unknown = int(np.count_nonzero(np.isnan(matrices[:, 0, 0])))
             if unknown:
                 faults[f"pose of {topic.name} at a time of which tf tells nothing"] += unknown
@@ -339,30 +331,22 @@ class _Reading:
                 f"{topic.name} has velocity commands, which tell no place; give the pose from "
                 "which they are followed with --start x,y,heading"
             )
-        stamps, commands = [], []
+        commands = []
         for log_time, message in self._messages(topic.name, topic.type_name):
-            command = command_of(message)
-            if not all(map(math.isfinite, command)):
-                self.faults["velocity command that is not finite"] += 1
-                continue
             stamped = topic.type_name == COMMAND_TYPES[0]
-            stamps.append(stamp_of(message) if stamped else log_time)
-            commands.append(command)
-        if not commands:
+            commands.append((stamp_of(message) if stamped else log_time, command_of(message)))
+        settings = self._settings
+        follower = CommandFollower(
+            settings.start_pose, settings.command_hold, settings.longest_silence
+        )
+        poses = follow(sorted(commands, key=itemgetter(0)), follower)
+        self.faults += follower.faults
+        if not poses:
             raise InputError(f"{topic.name} has no velocity command that can be used")
-        order = np.argsort(stamps, kind="stable")
-        times = (np.array(stamps, dtype=np.int64)[order] - min(stamps)) / _SECOND
-        hold = self._settings.command_hold
-        at, poses = follow(times, np.array(commands)[order], self._settings.start_pose, hold)
-        # Nobody knows what happened while nothing was commanded for long.
-        since = at - times[np.searchsorted(times, at, side="right") - 1]
-        until = np.append(times, np.inf)[np.searchsorted(times, at, side="right")] - at
-        known = (since <= hold) | (since + until <= self._settings.longest_silence)
-        at, poses = at[known], poses[known]
-        moments = min(stamps) + np.rint(at * _SECOND).astype(np.int64)
-        x, y, heading = self._settings.start_pose
+        stamps = np.array([pose.stamp for pose in poses], dtype=np.int64)
+        x, y, heading = settings.start_pose
         words = f"{topic.name} ({topic.type_name}), followed from ({x:g}, {y:g}), {heading:g} rad"
-        return _Motion(moments, poses, moments, words)
+        return _Motion(stamps, np.array(poses)[:, 1:], stamps, words)
 
     def _tf(self) -> TransformBuffer:
         """All transforms of the bag."""
@@ -400,50 +384,3 @@ def _sources(bag: Bag) -> list[Topic]:
         and not topic.name.endswith((*NO_MOTION, "tf_static"))
     ]
     return sorted(found, key=lambda topic: (_KINDS.index(topic.type_name), -topic.messages))
-
-
-def _moved(
-    matrices: npt.NDArray[np.float64],
-    points: npt.NDArray[np.float64],
-    headings: npt.NDArray[np.float64],
-) -> npt.NDArray[np.float64]:
-    """(P, 3) x, y and heading of poses after a transform each."""
-    positions = np.einsum("pij,pj->pi", matrices, points)
-    ahead = np.column_stack([np.cos(headings), np.sin(headings)])
-    turned = np.einsum("pij,pj->pi", matrices[:, :2, :2], ahead)
-    return np.column_stack([positions[:, :2], np.arctan2(turned[:, 1], turned[:, 0])])
-
-
-def _open_space(
-    positions: npt.NDArray[np.float64], resolution: float, frame_id: str, source: str
-) -> GridMap:
-    """A map without obstacles round positions (P, 2) [m], with a margin of a cell."""
-    low = np.floor(positions.min(axis=0) / resolution) - 1
-    high = np.floor(positions.max(axis=0) / resolution) + 2
-    width, height = (int(size) for size in high - low)
-    x, y = (low * resolution).tolist()
-    check_geometry(width, height, resolution, (x, y, 0.0), source)
-    return GridMap(np.ones((height, width), dtype=np.bool_), resolution, (x, y, 0.0), frame_id)
-
-
-def _on_opened(
-    opened: Sequence[tuple[int, int]],
-    planning: GridMap,
-    positions: npt.NDArray[np.float64],
-    grid_map: GridMap | None,
-) -> str:
-    """The sentence on cells that were opened since the robot was in them."""
-    named = ", ".join(f"({x}, {y})" for x, y in opened[:5]) + (", ..." if len(opened) > 5 else "")
-    sentence = (
-        f"planning map: the robot was in {len(opened)} blocked cells of {planning.resolution:g} m,"
-        f" which are open now: {named}"
-    )
-    assert grid_map is not None  # or there would be no blocked cells
-    where_free = positions[grid_map.is_free(grid_map.cells_of(positions))]
-    closed = {(x, y) for x, y in planning.cells_of(where_free).tolist()} & set(opened)
-    if closed:
-        sentence += (
-            f"; {len(closed)} of them only the coarsening had closed, for which the robot radius "
-            "or the planning resolution is too large"
-        )
-    return sentence

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections import Counter
 from typing import Any
@@ -38,13 +39,10 @@ class TransformBuffer:
         for transform in message.transforms:
             parent = frame_name(transform.header.frame_id)
             child = frame_name(transform.child_frame_id)
-            shift, turn = transform.transform.translation, transform.transform.rotation
-            pq = np.array([shift.x, shift.y, shift.z, turn.w, turn.x, turn.y, turn.z])
-            length = np.linalg.norm(pq[3:])
-            if not np.isfinite(pq).all() or length < 1e-6 or parent == child:
+            pq = _pq_of(transform.transform)
+            if not np.isfinite(pq).all() or parent == child:
                 self.faults["transform that is none"] += 1
                 continue
-            pq[3:] /= length
             if static:
                 self._static[child, parent] = pq
                 continue
@@ -141,6 +139,41 @@ class TransformBuffer:
             manager.add_transform(child, parent, KnownForATime(time, pqs))
         self._manager = manager
         return manager
+
+
+def matrix_of(transform: Any) -> npt.NDArray[np.float64]:
+    """The homogeneous matrix (4, 4) of a geometry_msgs/Transform; NaN where that is none."""
+    from pytransform3d.transformations import transform_from_pq
+
+    pq = _pq_of(transform)
+    return transform_from_pq(pq) if np.isfinite(pq).all() else np.full((4, 4), np.nan)
+
+
+def moved(
+    matrices: npt.NDArray[np.float64],
+    points: npt.NDArray[np.float64],
+    headings: npt.NDArray[np.float64],
+) -> npt.NDArray[np.float64]:
+    """(P, 3) x, y [m] and heading [rad] of poses after a transform each.
+
+    Args:
+        matrices: (P, 4, 4) homogeneous.
+        points: (P, 4) homogeneous [m].
+        headings: (P,) [rad].
+    """
+    positions = np.einsum("pij,pj->pi", matrices, points)
+    ahead = np.column_stack([np.cos(headings), np.sin(headings)])
+    turned = np.einsum("pij,pj->pi", matrices[:, :2, :2], ahead)
+    return np.column_stack([positions[:, :2], np.arctan2(turned[:, 1], turned[:, 0])])
+
+
+def _pq_of(transform: Any) -> npt.NDArray[np.float64]:
+    """(7,) position and unit quaternion, real part first; not finite where there is none."""
+    shift, turn = transform.translation, transform.rotation
+    pq = np.array([shift.x, shift.y, shift.z, turn.w, turn.x, turn.y, turn.z])
+    length = np.linalg.norm(pq[3:])
+    pq[3:] /= length if length >= 1e-6 else math.nan
+    return pq
 
 
 def frame_name(name: str) -> str:

@@ -6,11 +6,13 @@ import math
 from collections import Counter
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from bnirl_ros.demonstrations.discretising import Discretising
+from bnirl_ros.demonstrations.placement import episode_starts
 from bnirl_ros.demonstrations.recording import Recorder
 from bnirl_ros.demonstrations.velocity import in_map_axes
 from bnirl_ros.maps.coarsening import with_free
@@ -41,24 +43,25 @@ class Visit:
     Attributes:
         stamp: when it begins [ns].
         cell: (x, y) on the planning map.
+        position: (x, y) of the cell's centre in that map's frame [m].
         led_by: stamp [ns] of the visit before, and the index of the action chosen in it, which
             led here; None where an episode begins.
     """
 
     stamp: int
     cell: _Cell
+    position: tuple[float, float]
     led_by: tuple[int, int] | None
 
 
-@dataclass(frozen=True)
-class _Pose:
-    """A pose: stamp [ns], position [m] and along the planning map [cells], heading [rad]."""
+class _Pose(NamedTuple):
+    """A pose: stamp [ns], position [m], heading [rad], position along the planning map [cells]."""
 
     stamp: int
     x: float
     y: float
-    along: tuple[float, float]
     heading: float
+    along: tuple[float, float]
 
 
 class Discretiser:
@@ -84,24 +87,60 @@ class Discretiser:
             settings: how to put motion on it.
             moves: 4 or 8: which actions there are.
         """
-        self.grid_map = grid_map
+        self.grid_map = self._given = grid_map
         self.opened: list[_Cell] = []
         self.faults: Counter[str] = Counter()
+        self._places: dict[tuple[float, float], None] = {}  # the centres of visited cells
         self._silence = round(settings.longest_silence * _SECOND)
         self._dwell = round(settings.dwell * _SECOND)
-        # Any shorter one may end in a neighbouring cell, where no new episode can be told.
-        self._jump = max(settings.longest_jump, 3 * grid_map.resolution)
+        self._longest_jump = settings.longest_jump
         self._hold = round(settings.command_hold * _SECOND)
         self._moves = moves
         self._pose: _Pose | None = None
         self._visit: Visit | None = None
         self._told: Visit | None = None  # the last one that was returned
+        self._is_over = False  # its episode, whatever comes
         self._is_waiting = False  # where an episode begins, until it moves
         self._stood_from: _Pose | None = None  # where and since when it stands, if it does
         self._out_since: int | None = None  # when it left its cell, but not far
         self._heard: list[tuple[float, float]] = []
         self._command_age = 0
         self._intended = np.zeros(2)
+
+    def use_map(self, grid_map: GridMap) -> None:
+        """Go on over another planning map, as when SLAM has extended it; the same changes nothing.
+
+        What was visited is put on it by metres, as whoever has the visits as messages does, and
+        opened where it is blocked there. The episode goes on if its last cell is on that map.
+        """
+        if grid_map.is_same_as(self._given):
+            return
+        if grid_map.frame_id != self.grid_map.frame_id:
+            self._places.clear()
+            self._told = None
+            self.begin_episode()
+        self.grid_map = self._given = grid_map
+        cells = grid_map.cells_of(list(self._places))
+        blocked = cells[grid_map.contains(cells) & ~grid_map.is_free(cells)]
+        self.opened = list(dict.fromkeys((x, y) for x, y in blocked.tolist()))
+        self.grid_map = with_free(grid_map, self.opened)
+        if self._told:
+            self._told = replace(self._told, cell=self._cell_at(self._told.position))
+            self._is_over |= not bool(grid_map.contains([self._told.cell])[0])
+        if self._visit and self._pose:
+            self._visit = replace(self._visit, cell=self._cell_at(self._visit.position))
+            self._pose = self._posed(*self._pose[:-1])
+            if not grid_map.contains([self._visit.cell])[0]:
+                self.begin_episode()
+
+    def begin_episode(self) -> None:
+        """The next pose begins an episode, whatever its stamp, as when the clock jumped back.
+
+        So it does for whoever has the visits as messages, even where it is stamped and placed as
+        if the demonstrator had gone on: its first visit is then stamped before the last one.
+        """
+        self._pose = self._visit = None
+        self._is_over = True
 
     def hear(self, forwards: float, left: float) -> None:
         """Take in a velocity command, in the order in which poses and commands arrive.
@@ -128,8 +167,7 @@ class Discretiser:
         if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(heading)):
             self.faults["pose with a coordinate that is not finite"] += 1
             return []
-        u, v = self.grid_map.coordinates_of([[x, y]])[0].tolist()
-        before, pose = self._pose, _Pose(stamp, x, y, (u, v), heading)
+        before, pose = self._pose, self._posed(stamp, x, y, heading)
         if not self.grid_map.contains(self.grid_map.cells_of([[x, y]]))[0]:
             self.faults["pose outside the map"] += 1
             return []
@@ -139,11 +177,11 @@ class Discretiser:
             if stamp > self._visit.stamp:
                 self.faults["pose that is older than the one before"] += 1
                 return []
-            return self._begin(pose, at_once=True)
-        if (
-            stamp - before.stamp > self._silence
-            or math.hypot(x - before.x, y - before.y) > self._jump
-        ):
+            self.begin_episode()
+            return self._begin(pose)
+        # Any shorter one may end in a neighbouring cell, where no new episode can be told.
+        jump = max(self._longest_jump, 3 * self.grid_map.resolution)
+        if stamp - before.stamp > self._silence or math.hypot(x - before.x, y - before.y) > jump:
             return self._begin(pose)
         self._pose = pose
         self._intend(before, pose)
@@ -170,33 +208,45 @@ class Discretiser:
         is_near = low <= u - last[0] <= high and low <= v - last[1] <= high
         return last if is_near and pose.stamp - self._out_since <= _SETTLING else cell
 
-    def _begin(self, pose: _Pose, at_once: bool = False) -> list[Visit]:
-        """Begin an episode; unless `at_once`, it is told of when the demonstrator sets out."""
+    def _posed(self, stamp: int, x: float, y: float, heading: float) -> _Pose:
+        u, v = self.grid_map.coordinates_of([[x, y]])[0].tolist()
+        return _Pose(stamp, x, y, heading, (u, v))
+
+    def _cell_at(self, position: tuple[float, float]) -> _Cell:
+        ((x, y),) = self.grid_map.cells_of([position]).tolist()
+        return x, y
+
+    def _begin(self, pose: _Pose) -> list[Visit]:
+        """Begin an episode, of which is told when the demonstrator sets out."""
         self._pose = self._stood_from = pose
         u, v = pose.along
         cell = (math.floor(u), math.floor(v))
         told = self._told
-        if (
-            told
-            and 0 <= pose.stamp - told.stamp <= self._silence
-            and max(abs(cell[0] - told.cell[0]), abs(cell[1] - told.cell[1])) <= 1
-        ):
+        if told and not self._is_over and self._seems_to_go_on(told, pose.stamp, cell):
             # It seemed to be elsewhere for a moment, and nobody could tell this from going on.
-            self._visit, self._is_waiting = told, False
+            self._visit = told
+            self._is_waiting = False
             return (
-                self._go(replace(pose, stamp=told.stamp), pose, cell) if cell != told.cell else []
+                self._go(pose._replace(stamp=told.stamp), pose, cell) if cell != told.cell else []
             )
         self._open(cell)
-        self._is_waiting = not at_once
-        visit = self._enter(pose.stamp, cell, None)
-        return [visit] if at_once else []
+        self._is_waiting = True
+        self._enter(pose.stamp, cell, None)
+        return []
+
+    def _seems_to_go_on(self, told: Visit, stamp: int, cell: _Cell) -> bool:
+        """Whether a visit would seem to be of one episode with the last one that was told."""
+        stamps, cells = np.array([told.stamp, stamp]), np.array([told.cell, cell])
+        return not episode_starts(stamps, cells, self._silence / _SECOND)[1]
 
     def _enter(self, stamp: int, cell: _Cell, action: int | None) -> Visit:
         before = self._visit
         led_by = None if action is None or before is None else (before.stamp, action)
-        self._visit = Visit(stamp, cell, led_by)
+        x, y = self.grid_map.centres_of([cell])[0].tolist()
+        self._places[x, y] = None
+        self._visit = Visit(stamp, cell, (x, y), led_by)
         if not self._is_waiting:
-            self._told = self._visit
+            self._tell()
         self._out_since = None
         self._intended[:] = 0.0
         return self._visit
@@ -215,10 +265,9 @@ class Discretiser:
         held = min(elapsed, max(self._hold - self._command_age, 0))
         self._command_age += elapsed
         if self._heard and held:
-            mean = np.mean(self._heard, axis=0, keepdims=True)
-            # The map's own axes may be turned against the frame's.
-            heading = np.array([before.heading - self.grid_map.origin[2]])
-            self._intended += in_map_axes(mean, heading)[0] * (held / _SECOND)
+            forwards, left = np.mean(self._heard, axis=0).tolist()
+            velocity = in_map_axes(forwards, left, before.heading)
+            self._intended += np.array(velocity) * (held / _SECOND)
             self._heard = self._heard[-1:]
 
     def _stays(self, before: _Pose, pose: _Pose, left: bool) -> list[Visit]:
@@ -246,24 +295,31 @@ class Discretiser:
             if pose.stamp <= due:
                 break
             action = self._held_up()
-            if self._is_waiting and action == _STAY:
-                self._enter(due, self._visit.cell, None)
-            else:
-                if self._is_waiting:
-                    visits.append(self._set_out(self._visit.stamp))
-                visits.append(self._enter(due, self._visit.cell, action))
+            if self._is_waiting and action != _STAY:
+                visits.append(self._set_out(self._visit.stamp))
+                continue
+            visit = self._enter(due, self._visit.cell, None if self._is_waiting else action)
+            if not self._is_waiting:
+                visits.append(visit)
             since = due
-        if moved:
-            self._stood_from = replace(pose, stamp=since)
-        else:
-            self._stood_from = replace(stood, stamp=since)
+        self._stood_from = (pose if moved else stood)._replace(stamp=since)
         return visits
 
     def _set_out(self, stamp: int) -> Visit:
         """The first visit of an episode, once the demonstrator moves or means to."""
         assert self._visit is not None
         self._is_waiting = False
-        self._visit = self._told = replace(self._visit, stamp=stamp)
+        told = self._told
+        if told and self._seems_to_go_on(told, stamp, self._visit.cell):
+            # The clock jumped back by little, or the demonstrator stood until it had caught up.
+            stamp = told.stamp - 1
+        self._visit = replace(self._visit, stamp=stamp)
+        return self._tell()
+
+    def _tell(self) -> Visit:
+        """The present visit, which is returned now."""
+        assert self._visit is not None
+        self._told, self._is_over = self._visit, False
         return self._visit
 
     def _held_up(self) -> int:
@@ -273,7 +329,10 @@ class Discretiser:
             return _STAY
         actions = list(ACTION_SETS[self._moves][1:])
         directions = STEPS[actions] / np.linalg.norm(STEPS[actions], axis=1, keepdims=True)
-        return actions[int(np.argmax(directions @ self._intended))]
+        # The map's own axes may be turned against the frame's.
+        x, y = self._intended.tolist()
+        along = in_map_axes(x, y, -self.grid_map.origin[2])
+        return actions[int(np.argmax(directions @ along))]
 
     def _go(self, before: _Pose, pose: _Pose, cell: _Cell) -> list[Visit]:
         """The visits on the way from the last one to another cell, the one there the last."""
@@ -312,14 +371,13 @@ def _off(cell: _Cell, before: _Pose, after: _Pose) -> float:
     return abs((s - u) * (cell[1] + 0.5 - v) - (t - v) * (cell[0] + 0.5 - u))
 
 
-def record(recorder: Recorder, visit: Visit, grid_map: GridMap) -> None:
+def record(recorder: Recorder, visit: Visit, frame_id: str) -> None:
     """Hand a visit to a recorder as the contract's pose, and the action that led to it."""
     if visit.led_by:
         stamp, action = visit.led_by
         dx, dy = STEPS[action].tolist()
         recorder.add_action(stamp, dx, dy)
-    x, y = grid_map.centres_of([visit.cell])[0].tolist()
-    recorder.add_pose(visit.stamp, grid_map.frame_id, x, y)
+    recorder.add_pose(visit.stamp, frame_id, *visit.position)
 
 
 def fill_jumps(cells: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

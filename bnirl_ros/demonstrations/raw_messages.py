@@ -8,7 +8,9 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from bnirl_ros.demonstrations.frames import frame_name
+import numpy as np
+
+from bnirl_ros.demonstrations.frames import frame_name, matrix_of, moved
 from bnirl_ros.demonstrations.messages import stamp_of
 from bnirl_ros.errors import InputError
 from bnirl_ros.maps.occupancy import yaw_of
@@ -59,6 +61,20 @@ def pose_of(message: Any) -> RawPose:
     return RawPose(
         stamp_of(message), frame_name(message.header.frame_id), (at.x, at.y, at.z), heading
     )
+
+
+def brought(pose: RawPose, transform: Any) -> RawPose:
+    """A pose after a geometry_msgs/TransformStamped, in the frame of its header.
+
+    Its position and heading are NaN where the transform is none.
+    """
+    ((x, y, heading),) = moved(
+        matrix_of(transform.transform)[np.newaxis],
+        np.array([[*pose.position, 1.0]]),
+        np.array([pose.heading]),
+    ).tolist()
+    frame_id = frame_name(transform.header.frame_id)
+    return RawPose(pose.stamp, frame_id, (x, y, 0.0), heading)
 
 
 def command_of(message: Any) -> Command:

@@ -17,7 +17,8 @@ from bnirl_ros.bags.cdr import decode
 from bnirl_ros.bags.reader import Bag
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.demonstrations.motion import fill_jumps
-from bnirl_ros.demonstrations.velocity import follow
+from bnirl_ros.demonstrations.raw_messages import Command
+from bnirl_ros.demonstrations.velocity import CommandFollower, follow
 from bnirl_ros.errors import InputError
 from bnirl_ros.maps import GridMap
 from bnirl_ros.mdp.actions import STEPS
@@ -120,7 +121,7 @@ def drive(
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Where commands lead in turtlesim: times (M,) [s], and positions (M, 2) [m].
 
-    As `follow` has it; at the edges of the square the robot slides along.
+    As `CommandFollower` has it; at the edges of the square the robot slides along.
 
     Args:
         times: (N,) when each command comes, ascending [s].
@@ -128,5 +129,7 @@ def drive(
         start: x, y and heading at the first command [m, m, rad].
         side: edge of the square, from (0, 0) [m].
     """
-    times, poses = follow(times, commands, start, HOLD, side)
-    return times, poses[:, :2]
+    stamps = np.rint(times * 1e9).astype(np.int64).tolist()
+    heard = zip(stamps, (Command(*each) for each in commands.tolist()), strict=True)
+    poses = np.array(follow(heard, CommandFollower(start, HOLD, side=side)))
+    return poses[:, 0] / 1e9, poses[:, 1:3]
