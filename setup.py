@@ -94,6 +94,7 @@ setup(
     entry_points={
         "console_scripts": [
             "bnirl = bnirl_ros.cli:main",
+            "discretiser_node = bnirl_ros.nodes.start:discretiser_node",
             "replay_node = bnirl_ros.nodes.start:replay_node",
             "subgoal_node = bnirl_ros.nodes.start:subgoal_node",
         ],

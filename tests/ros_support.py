@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import os
 import signal
 import subprocess
@@ -14,6 +15,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import bnirl_ros
@@ -291,3 +293,14 @@ def assert_silent_end(process: NodeProcess, number: signal.Signals) -> None:
     assert end.status == 0, end
     assert "Traceback" not in end.err
     assert "Error" not in end.err
+
+
+def assert_same_results(folder: Path, other: Path) -> None:
+    """The result files of two inferences are equal number for number."""
+    first, second = ((each / "subgoals.json").read_text() for each in (folder, other))
+    assert json.loads(first) == json.loads(second)
+    with np.load(folder / "posterior.npz") as one, np.load(other / "posterior.npz") as two:
+        assert set(one) == set(two)
+        for name in one:
+            np.testing.assert_array_equal(one[name], two[name])
+    assert (folder / "subgoals.png").is_file()

@@ -73,7 +73,8 @@ def all_of(news: Iterable[News]) -> list[Visit]:
 
 commands = st.lists(
     st.tuples(
-        st.integers(0, 3_000_000_000) | st.sampled_from([0, 16_000_000, SECOND, 2 * SECOND]),
+        st.integers(0, 3_000_000_000)
+        | st.sampled_from([16_000_000, SECOND, 2 * SECOND, 5 * SECOND]),
         st.builds(Command, *[st.floats(-2, 2)] * 3),
     ),
     max_size=8,
@@ -219,21 +220,27 @@ def test_a_jump_by_little_is_told_by_the_stamps() -> None:
     # It stands where it was until the clock has caught up, and sets out for the next cell.
     discretiser.begin_episode()
     end = there[-1][0]
-    after = followed(discretiser, [(end + t, x, 0.5) for t, x in ((-1, 2.5), (1, 2.5), (2, 3.5))])
+    drive = [(end - 0.1, 2.5, 0.5), (end + 1.0, 2.5, 0.5), (end + 2.0, 3.5, 0.5)]
+    after = followed(discretiser, drive)
     assert [visit.cell for visit in after] == [(2, 0), (3, 0)]
     assert after[0].led_by is None
     assert after[0].stamp == visits[-1].stamp - 1
+    # Or it is held up there. The visit that is stamped so early is no longer ago than any.
+    discretiser.begin_episode()
+    held = followed(discretiser, [(end + 8.0 + t / 2, 3.5, 0.5) for t in range(12)], 0.8)
+    assert [visit.led_by is None for visit in held[:2]] == [True, False]
+    assert 0 <= held[1].stamp - held[0].stamp <= 8 * SECOND
 
 
 def test_who_is_off_the_new_map_begins_an_episode() -> None:
-    cut = GridMap(OPEN.free, 1.0, (3.0, 3.0, 0.0))
     drive = walk((0.5, 2.5), (2.5, 2.5))
     end = drive[-1][0]
-    further = [(end + 0.5, 3.5, 3.5), (end + 3.0, 4.5, 3.5)]
-    for glance in ([], [(end + 0.1, 7.5, 7.5)]):  # for a moment it seemed to be on it
+    glance = [(end + 0.1, 7.5, 7.5)]  # for a moment it seemed to be on the map
+    for low, seen in ((2.0, drive), (3.0, drive), (2.0, drive + glance), (3.0, drive + glance)):
         discretiser = Discretiser(OPEN, SETTINGS)
-        visits = followed(discretiser, drive + glance)
-        discretiser.use_map(cut)
+        visits = followed(discretiser, seen)
+        discretiser.use_map(GridMap(OPEN.free, 1.0, (3.0, low, 0.0)))
+        further = [(end + 0.5, 3.5, low + 0.5), (end + 3.0, 4.5, low + 0.5)]
         after = followed(discretiser, further)
         assert [visit.cell for visit in after] == [(0, 0), (1, 0)]
         assert after[0].led_by is None

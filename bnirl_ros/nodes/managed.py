@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -34,6 +34,14 @@ AUTOSTART = NodeParameter(
     Changeable.NEVER,
 )
 """The parameter that all managed nodes have."""
+
+DIAGNOSTICS = NodeTopic(
+    "/diagnostics",
+    DiagnosticArray.TYPE,
+    "once a second: what the node does, what it found and what it left out, counted by reason",
+    latched=False,
+)
+"""The topic that all managed nodes publish, in whatever state they are."""
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """The last message is kept for whoever comes late."""
@@ -68,6 +76,7 @@ class ManagedNode(LifecycleNode):
         self.active = False
         self.faults: Counter[str] = Counter()
         self.configured = False
+        self._told: dict[str, int] = {}  # with how many digits each fault was told
         self._failure = ""  # why the last transition was not made
         self._heard: list[Any] = []
         self._advertised: list[Any] = []
@@ -79,7 +88,7 @@ class ManagedNode(LifecycleNode):
         declare(self, (AUTOSTART, *table))
         self.add_on_set_parameters_callback(self._refuse_late_changes)
         self._diagnostics = self.create_publisher(
-            message_class(DiagnosticArray.TYPE), "/diagnostics", 10
+            message_class(DIAGNOSTICS.type_name), DIAGNOSTICS.name, 10
         )
         self.every(_DIAGNOSTICS_PERIOD, self._publish_diagnostics)
 
@@ -147,7 +156,7 @@ class ManagedNode(LifecycleNode):
         return publishers
 
     def hear(
-        self, topic: str, type_name: str, callback: Callable[[Any], None], qos: QoSProfile
+        self, topic: str, type_name: str, callback: Callable[..., None], qos: QoSProfile
     ) -> None:
         """Hear a topic until the node is deactivated; lost messages are counted."""
         self._heard.append(
@@ -161,15 +170,12 @@ class ManagedNode(LifecycleNode):
             )
         )
 
-    def count(self, fault: str) -> None:
-        """Count a fault of the node's own, and tell of it."""
-        self.faults[fault] += 1
-        self.tell(fault, self.faults[fault])
-
-    def tell(self, fault: str, count: int) -> None:
-        """Tell of the first one, the tenth, the hundredth...: no flood, and no silence."""
-        if str(count).strip("0") == "1":
-            self.get_logger().warning(f"left out {count} x {fault}")
+    def tell(self, faults: Mapping[str, int]) -> None:
+        """Log the first of a fault's messages, ten, a hundred...: no flood, and no silence."""
+        for fault, count in faults.items():
+            if count and len(str(count)) > self._told.get(fault, 0):
+                self._told[fault] = len(str(count))
+                self.get_logger().warning(f"left out {count} x {fault}")
 
     def stamp(self) -> int:
         """Now [ns], by the node's clock."""
@@ -245,6 +251,7 @@ class ManagedNode(LifecycleNode):
                 self.destroy_lifecycle_publisher(publisher)
             self._advertised.clear()
             self.faults.clear()
+            self._told.clear()
 
     def _refuse_late_changes(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         late = [each.name for each in parameters if each.name in self._taken_when_configured]

@@ -16,6 +16,11 @@ def subgoal_node() -> int:
     return _main_of("subgoal_node")
 
 
+def discretiser_node() -> int:
+    """Run the discretiser node; returns the exit status."""
+    return _main_of("discretiser_node")
+
+
 def replay_node() -> int:
     """Run the replay node; returns the exit status."""
     return _main_of("replay_node")

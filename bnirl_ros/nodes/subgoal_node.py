@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError
 from pathlib import Path
@@ -213,6 +212,9 @@ class SubgoalNode(ManagedNode):
     def health(self) -> Health:
         """How the inference gets on, and what was left out."""
         self._look()  # whoever reads "settled" has the last result
+        # What the last result left out may only have come too late for it.
+        faults = self._recorder.faults + self.faults
+        self.tell(faults)
         result = self._result
         summary = result.summary if result else None
         observations = len(result.placement.demonstration) if result else 0
@@ -229,9 +231,7 @@ class SubgoalNode(ManagedNode):
                 result.sweeps if result else 0,
                 len(self._recorder) - (result.placement.messages if result else 0),
             ),
-            faults=self._recorder.faults
-            + self.faults
-            + (result.placement.faults if result else Counter()),
+            faults=faults + result.placement.faults if result else faults,
             error=self._inference.error or self._watch.error,
             last_error=self._inference.last_error or self._watch.last_error,
         )
@@ -248,9 +248,7 @@ class SubgoalNode(ManagedNode):
         self._taken(take_action(self._recorder, message))
 
     def _taken(self, fault: str | None) -> None:
-        if fault:
-            self.tell(fault, self._recorder.faults[fault])
-        else:
+        if fault is None:
             self._inference.observations_arrived()
             self._watch.observations_arrived()
 
@@ -260,7 +258,7 @@ class SubgoalNode(ManagedNode):
             if self._features:
                 grid_map = with_features(grid_map, self._features)
         except InputError as error:
-            self.count(str(error))
+            self.faults[str(error)] += 1
             return
         self._recorder.map_arrived()
         self._inference.use_map(grid_map)

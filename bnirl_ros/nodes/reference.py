@@ -1,0 +1,148 @@
+"""docs/reference.md, made of the tables that the nodes themselves are made of.
+
+python -m bnirl_ros.nodes.reference docs/reference.md
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from bnirl_ros.inference.settings import Settings
+from bnirl_ros.nodes import discretiser_node, subgoal_node
+from bnirl_ros.nodes.managed import AUTOSTART, DIAGNOSTICS
+from bnirl_ros.nodes.parameters import NodeParameter, parameter_of
+from bnirl_ros.nodes.topics import NodeService, NodeTopic
+
+_INTRODUCTION = """\
+# Topics, services and parameters
+
+This page is made of the tables that the nodes are made of: `make reference` writes it. `ros2 node
+info`, `ros2 param list` and `ros2 param describe` tell the same of a node that runs.
+
+Names without a leading slash are relative: they are in the node's namespace, and can be remapped.
+Those with `~/` are under the node's own name.
+
+## What both nodes have in common
+
+Both are managed nodes with the services `~/change_state` and `~/get_state` of lifecycle_msgs. A
+node that is not active hears and publishes nothing but `/diagnostics`; what it has gathered it
+keeps until it is cleaned up. With `autostart` it configures and activates itself.
+
+A parameter that is changed *at any time* takes effect at once, one that is changed *while
+unconfigured* with the next configuration, and one that is given *at the start only* is read-only.
+A value that cannot be is refused with the reason.
+
+The QoS of each topic is a read-only parameter: `qos_overrides.<topic>.subscription.reliability`,
+`.history` and `.depth`, and the same with `publisher`; `<topic>` is the whole name, such as
+`/pose`. What is latched is reliable and transient local with a depth of one. `use_sim_time` makes
+`/clock` the time of what is published; a stamp that goes back begins a new episode.
+
+`replay_node --help` and `bnirl --help` tell of the programs that are no managed nodes.
+"""
+
+
+@dataclass(frozen=True)
+class _Page:
+    """What there is to tell of a node."""
+
+    name: str
+    summary: str
+    inputs: Sequence[NodeTopic]
+    outputs: Sequence[NodeTopic]
+    services: Sequence[NodeService]
+    parameters: Sequence[NodeParameter]
+
+
+_PAGES = (
+    _Page(
+        "subgoal_node",
+        subgoal_node.SubgoalNode.__doc__ or "",
+        subgoal_node.INPUTS,
+        subgoal_node.OUTPUTS,
+        subgoal_node.SERVICES,
+        (*map(parameter_of, fields(Settings)), *subgoal_node.PARAMETERS),
+    ),
+    _Page(
+        "discretiser_node",
+        discretiser_node.DiscretiserNode.__doc__ or "",
+        discretiser_node.INPUTS,
+        discretiser_node.OUTPUTS,
+        (),
+        discretiser_node.PARAMETERS,
+    ),
+)
+
+
+def reference() -> str:
+    """The page, in Markdown."""
+    return "\n".join([_INTRODUCTION, *map(_section, _PAGES)])
+
+
+def _section(page: _Page) -> str:
+    first_line = page.summary.partition("\n")[0]
+    parts = [f"## {page.name}\n\n{first_line}\n"]
+    parts.append("### Heard\n\n" + _topic_table(page.inputs))
+    parts.append("### Published\n\n" + _topic_table((*page.outputs, DIAGNOSTICS)))
+    if page.services:
+        rows = [(f"`{each.name}`", each.type_name, each.meaning) for each in page.services]
+        parts.append("### Services\n\n" + _table(("service", "type", "what it does"), rows))
+    parts.append("### Parameters\n\n" + _parameter_table((AUTOSTART, *page.parameters)))
+    return "\n".join(parts)
+
+
+def _topic_table(topics: Iterable[NodeTopic]) -> str:
+    rows = [
+        (
+            f"`{topic.name}`",
+            topic.type_name + (", latched" if topic.latched else ""),
+            topic.meaning,
+        )
+        for topic in topics
+    ]
+    return _table(("topic", "type", "meaning"), rows)
+
+
+def _parameter_table(parameters: Iterable[NodeParameter]) -> str:
+    rows = [
+        (
+            f"`{each.name}`",
+            type(each.default).__name__,
+            f"`{_in_yaml(each.default)}`",
+            _range(each),
+            each.changeable.value,
+            each.limits.description,
+        )
+        for each in parameters
+    ]
+    return _table(("parameter", "type", "default", "range", "changed", "meaning"), rows)
+
+
+def _range(parameter: NodeParameter) -> str:
+    limits = parameter.limits
+    if limits.choices:
+        return ", ".join(map(str, limits.choices))
+    if isinstance(parameter.default, str | bool):
+        return ""
+    return limits.range_in_words()
+
+
+def _in_yaml(value: object) -> str:
+    """A default as it is written in a parameter file."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return f"{value:.1f}" if math.isfinite(value) and value == round(value) else f"{value:g}"
+    return f'"{value}"' if value == "" else str(value)
+
+
+def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+if __name__ == "__main__":
+    Path(sys.argv[1]).write_text(reference(), encoding="utf-8")
