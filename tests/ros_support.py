@@ -199,6 +199,11 @@ class Watched:
             "message": status.message,
         }
 
+    @property
+    def clock(self) -> int:
+        """The time of its last diagnostics, by its own clock [s]."""
+        return self._diagnostics[-1].header.stamp.sec if self._diagnostics else -1
+
     def until_health(self, what: str, **wanted: str) -> dict[str, str]:
         """Wait for diagnostics that say so."""
 
