@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,6 +33,8 @@ from bnirl_ros.views.results import subgoals_document, subgoals_in
 from bnirl_ros.views.tables import convergence, report, subgoal_table
 from bnirl_ros.views.waypoints import headings, waypoint_path
 from bnirl_ros.views.ways import MOST_NUMBERED, MOST_WAYS, route_of
+
+ROOT = Path(__file__).resolve().parent.parent
 
 STAMP = 12_345_678_901
 YAW = math.pi / 2
@@ -342,6 +346,28 @@ def test_the_intent_is_arrows_as_opaque_as_it_is_probable(intent, summary, grid_
         pytest.approx((start + end) / 2),
     ]
     assert [marker.action for marker in no_intent(grid_map, STAMP).markers] == [Marker.DELETEALL]
+
+
+def found_at(message: object, path: str) -> list[Any]:
+    """What Foxglove finds in a message, at a path such as `markers[:]{ns=="a"}{id==1}.color.a`."""
+    found = [message]
+    for name, each, conditions in re.findall(r"(\w+)(\[:\])?((?:\{[^}]+\})*)", path):
+        found = [getattr(part, name) for part in found]
+        if each:
+            found = [part for parts in found for part in parts]
+        for key, value in re.findall(r"\{(\w+)==([^}]+)\}", conditions):
+            found = [part for part in found if getattr(part, key) == json.loads(value)]
+    return found
+
+
+def test_foxglove_plots_how_probable_each_subgoal_is(intent):
+    layout = json.loads((ROOT / "foxglove" / "subgoals.json").read_text(encoding="utf-8"))
+    series = layout["configById"]["Plot!intent"]["paths"]
+    topics, paths = zip(*(each["value"].split(".", 1) for each in series), strict=True)
+    assert {*topics} == {"/intent"}
+    markers = intent_markers(intent, STAMP)
+    plotted = [found_at(markers, path) for path in paths]
+    assert plotted == [[], [], [pytest.approx(0.6)], *[[]] * (len(paths) - 3)]
 
 
 def test_belief_is_the_probability_in_percent(summary, grid_map):
