@@ -1,12 +1,14 @@
-"""Settings for all tests, and fixtures of those that start nodes."""
+"""Settings for all tests, and fixtures that several of them share."""
 
 from __future__ import annotations
 
+import runpy
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+import setuptools
 from hypothesis import settings
 
 if TYPE_CHECKING:
@@ -15,6 +17,16 @@ if TYPE_CHECKING:
 # How long an example takes says nothing here: kernels compile, and the machine may be busy.
 settings.register_profile("bnirl_ros", deadline=None)
 settings.load_profile("bnirl_ros")
+
+
+@pytest.fixture
+def setup_arguments(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What setup.py hands over to setuptools."""
+    arguments: dict[str, Any] = {}
+    monkeypatch.chdir(Path(__file__).resolve().parent.parent)
+    monkeypatch.setattr(setuptools, "setup", arguments.update)
+    runpy.run_path("setup.py")
+    return arguments
 
 
 @pytest.fixture(scope="module")

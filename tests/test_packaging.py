@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import importlib
 import re
-import runpy
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
@@ -13,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import setuptools
 
 import bnirl_ros
 
@@ -40,16 +38,6 @@ REQUIREMENT_OF_MODULE = {"PIL": "pillow", "yaml": "pyyaml"}
 
 # Packages of a ROS installation that are no messages, by the name under which they are imported.
 ROS_MODULES = {"ament_index_python", "launch", "launch_ros", "rclpy"}
-
-
-@pytest.fixture
-def setup_arguments(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """What setup.py hands over to setuptools."""
-    arguments: dict[str, Any] = {}
-    monkeypatch.chdir(ROOT)
-    monkeypatch.setattr(setuptools, "setup", arguments.update)
-    runpy.run_path("setup.py")
-    return arguments
 
 
 @pytest.fixture
@@ -136,7 +124,7 @@ def test_there_is_one_version(
     assert package_xml.findtext("version") == bnirl_ros.__version__
 
 
-@pytest.mark.parametrize("name", ["bnirl", "replay_node", "subgoal_node"])
+@pytest.mark.parametrize("name", ["bnirl", "discretiser_node", "replay_node", "subgoal_node"])
 def test_executables_start_at_a_function(name: str, setup_arguments: dict[str, Any]) -> None:
     scripts = setup_arguments["entry_points"]["console_scripts"]
     place = dict(re.split(r"\s*=\s*", script) for script in scripts)[name]
