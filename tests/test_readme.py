@@ -6,12 +6,10 @@ import re
 import shlex
 import subprocess
 import sys
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from bnirl_ros.bags.definitions import full_type_name
 from bnirl_ros.bags.demonstration import read_demonstration
@@ -26,6 +24,7 @@ from bnirl_ros.inference.settings import Settings
 from bnirl_ros.inference.summary import summarise
 from bnirl_ros.maps import GridMap
 from bnirl_ros.mdp.actions import ACTION_NAMES
+from launch_support import declared
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -109,21 +108,12 @@ def test_replay_commands_parse() -> None:
         parse(arguments)
 
 
-def test_launch_arguments_are_declared_and_are_the_replays() -> None:
-    text = (ROOT / "launch" / "subgoals.launch.py").read_text(encoding="utf-8")
-    declared = set(re.findall(r'DeclareLaunchArgument\(\s*"(\w+)"', text))
-    assert declared == {"bag", "rate", "params_file"}
-    used = {
-        word.partition(":=")[0]
-        for _, *words in arguments_of("ros2", "launch", "bnirl_ros")
-        for word in words
-    }
-    assert used <= declared
-    pytest.importorskip("rclpy")
-    from bnirl_ros.nodes.replay_node import parse
-
-    assert 'arguments=[bag, "--rate", LaunchConfiguration("rate")]' in text
-    assert parse(["a bag", "--rate", "10.0"]).rate == 10.0
+def test_launch_arguments_are_declared() -> None:
+    launches = arguments_of("ros2", "launch", "bnirl_ros")
+    assert launches
+    for file, *words in launches:
+        names = {argument.name for argument in declared(ROOT / "launch" / file)}
+        assert {word.partition(":=")[0] for word in words} <= names
 
 
 def test_make_targets_exist() -> None:
@@ -206,28 +196,6 @@ def test_services_are_the_codes() -> None:
     node = (ROOT / "bnirl_ros" / "nodes" / "subgoal_node.py").read_text(encoding="utf-8")
     services = re.findall(r'create_service\((\w+), "(~/\w+)"', node)
     assert table("service") == {name: f"std_srvs/{kind}" for kind, name in services}
-
-
-def test_parameter_file_has_every_parameter_with_its_default() -> None:
-    pytest.importorskip("rclpy")
-    from bnirl_ros.nodes.parameters import INFERRED
-
-    text = (ROOT / "config" / "subgoal_node.yaml").read_text(encoding="utf-8")
-    given = yaml.safe_load(text)["/**"]["ros__parameters"]
-    settings = {
-        setting.name: INFERRED if setting.default is None else setting.default
-        for setting in fields(Settings)
-    }
-    assert {name: given.get(name) for name in settings} == settings
-    # ROS takes no integer for a parameter of floating point.
-    assert {name: type(given[name]) for name in settings} == {
-        name: type(default) for name, default in settings.items()
-    }
-    from bnirl_ros.nodes.subgoal_node import PARAMETERS
-
-    own = {parameter.name: parameter.default for parameter in PARAMETERS}
-    assert given == settings | own
-    assert all(type(given[name]) is type(default) for name, default in own.items())
 
 
 @pytest.fixture(scope="module")
