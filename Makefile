@@ -29,7 +29,7 @@ endif
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 unexport AMENT_PREFIX_PATH PYTHONPATH PYTHONHOME RMW_IMPLEMENTATION
 
-.PHONY: help demo test lint unit bags benchmark study reproduce venv clean
+.PHONY: help demo test lint unit bags reference benchmark study reproduce venv clean
 
 help:  ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -50,6 +50,9 @@ unit: venv  ## Run the tests, without the checks of style and types
 bags: venv  ## Make the bags in bags/ again
 	$(BIN)/python -m bnirl_ros.experiments.make_bags --overcooked "$(OVERCOOKED)" \
 		--turtle "$(TURTLE)"
+
+reference: venv  ## Write docs/reference.md, the topics and parameters of the nodes
+	$(BIN)/python -m bnirl_ros.nodes.reference docs/reference.md
 
 benchmark: venv  ## Time the main job and its parts
 	$(BIN)/python benchmarks/main_job.py

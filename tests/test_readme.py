@@ -11,11 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bnirl_ros.bags.definitions import full_type_name
 from bnirl_ros.bags.demonstration import read_demonstration
 from bnirl_ros.cli import _parser
 from bnirl_ros.demonstrations.demonstration import Demonstration
-from bnirl_ros.demonstrations.messages import TOPIC_TYPES
 from bnirl_ros.demonstrations.placement import place
 from bnirl_ros.experiments.scenarios import PAPER_LOOP
 from bnirl_ros.inference.posterior import infer
@@ -59,13 +57,6 @@ def arguments_of(*beginning: str) -> list[list[str]]:
     """What follows this beginning in the README's commands that go on."""
     words = [command for command in commands(README) if command[: len(beginning)] == [*beginning]]
     return [command[len(beginning) :] for command in words if len(command) > len(beginning)]
-
-
-def table(heading: str) -> dict[str, str]:
-    """First and second column of the README's table whose first heading is this."""
-    lines = README[README.index(f"| {heading} |") :].split("\n\n")[0].splitlines()[2:]
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-    return {row[0].strip("`"): row[1] for row in rows}
 
 
 def test_python_example_runs_and_finds_the_true_subgoals() -> None:
@@ -171,31 +162,24 @@ def test_names_in_the_architecture_exist() -> None:
             assert re.search(rf"\b{name.removesuffix('()')}\b", code), name
 
 
-def test_input_topics_are_the_codes() -> None:
-    told = table("`subgoal_node` hears")
-    types = {name: full_type_name(kind.partition(",")[0]) for name, kind in told.items()}
-    assert types == TOPIC_TYPES
-    assert told["map"].endswith(", transient local")
-
-
-def test_output_topics_are_the_codes() -> None:
+def test_the_reference_is_current() -> None:
     pytest.importorskip("rclpy")
-    from bnirl_ros.nodes.subgoal_node import OUTPUTS
-    from bnirl_ros.views.messages import DiagnosticArray
+    from bnirl_ros.nodes.reference import reference
 
-    told = table("`subgoal_node` publishes")
-    types = {name: full_type_name(kind.partition(",")[0]) for name, kind in told.items()}
-    published = {topic.name: topic.type_name for topic in OUTPUTS}
-    assert types == {**published, "/diagnostics": DiagnosticArray.TYPE}
-    assert {name for name, kind in told.items() if kind.endswith(", transient local")} == {
-        topic.name for topic in OUTPUTS if topic.latched
-    }
+    assert (ROOT / "docs" / "reference.md").read_text(encoding="utf-8") == reference(), (
+        "run make reference"
+    )
 
 
-def test_services_are_the_codes() -> None:
-    node = (ROOT / "bnirl_ros" / "nodes" / "subgoal_node.py").read_text(encoding="utf-8")
-    services = re.findall(r'create_service\((\w+), "(~/\w+)"', node)
-    assert table("service") == {name: f"std_srvs/{kind}" for kind, name in services}
+def test_the_readme_names_every_topic_and_service() -> None:
+    pytest.importorskip("rclpy")
+    from bnirl_ros.nodes import discretiser_node, subgoal_node
+
+    tables = (
+        *(subgoal_node.INPUTS, subgoal_node.OUTPUTS, subgoal_node.SERVICES),
+        *(discretiser_node.INPUTS, discretiser_node.OUTPUTS),
+    )
+    assert {entry.name for table in tables for entry in table} <= set(spans(README))
 
 
 @pytest.fixture(scope="module")

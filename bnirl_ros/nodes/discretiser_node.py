@@ -77,7 +77,7 @@ INPUTS = (
     NodeTopic(
         "map",
         TOPIC_TYPES["map"],
-        "the robot's own map, of whatever resolution; heard unless `open_space` takes its place",
+        "the robot's own map, of whatever resolution; a new one takes the place of the one before",
     ),
 )
 """What is heard besides the topics that `source` and `intent` name, and tf."""
@@ -118,11 +118,8 @@ _PUBLISHER_DEPTH = 1000
 class DiscretiserNode(ManagedNode):
     """Makes poses, actions and a planning map of what a robot publishes anyway.
 
-    The motion is that on the topic that the parameter `source` names: nav_msgs/Odometry,
-    geometry_msgs/PoseWithCovarianceStamped, geometry_msgs/PoseStamped, tf2_msgs/TFMessage, or,
-    from a given `start`, geometry_msgs/Twist or TwistStamped. If it names none, odometry is taken
-    where there is tf, and else poses with covariance, as AMCL's. The parameter `intent` names
-    commands that tell where the robot was bound for while it was held up.
+    The topics of the motion are looked for until they are there, since their types tell what to
+    hear. All that is done with it is in `LiveMotion`.
     """
 
     def __init__(self) -> None:

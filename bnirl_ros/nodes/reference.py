@@ -38,10 +38,47 @@ A value that cannot be is refused with the reason.
 
 The QoS of each topic is a read-only parameter: `qos_overrides.<topic>.subscription.reliability`,
 `.history` and `.depth`, and the same with `publisher`; `<topic>` is the whole name, such as
-`/pose`. What is latched is reliable and transient local with a depth of one. `use_sim_time` makes
-`/clock` the time of what is published; a stamp that goes back begins a new episode.
+`/pose`. What is latched is reliable and transient local with a depth of one, so that whoever comes
+late gets the last message. `use_sim_time` makes `/clock` the time of what is published; where it
+jumps back a new episode begins.
+
+What cannot be used is left out, counted by its fault, and told on `/diagnostics`, in the log the
+first time and at every tenfold.
 
 `replay_node --help` and `bnirl --help` tell of the programs that are no managed nodes.
+"""
+
+_ON_SUBGOALS = """\
+Pose and action are paired by equal stamps. A new episode begins where the stamps of poses are more
+than `episode_gap` apart or go backwards, or the cells are no neighbours.
+
+`current_subgoal` and `intent` follow the demonstrator, not the inference: they come within a
+fraction of a second of a pose or action, ten times a second at most, by the latest posterior that
+there is, also while inference rests. Now is when the next action is chosen, so on arrival they
+turn to what may come next. Before the first posterior, and with the paper's model, which knows no
+order, there are none. A pose cannot be taken back: after `~/reset` the last `current_subgoal`
+stays, and `intent` is emptied. `docs/inference.md` tells how early the next subgoal is named.
+"""
+
+_ON_DISCRETISING = """\
+The motion is that on the topic that `source` names:
+
+| type | what it takes |
+| --- | --- |
+| nav_msgs/msg/Odometry | tf2_ros, unless the map is in its frame |
+| geometry_msgs/msg/PoseWithCovarianceStamped | as of AMCL |
+| geometry_msgs/msg/PoseStamped | |
+| tf2_msgs/msg/TFMessage | tf2_ros; followed is `base_frame` |
+| geometry_msgs/msg/TwistStamped, geometry_msgs/msg/Twist | `start` |
+
+The node waits until the topic is there and asks for its type. If `source` is empty it takes
+odometry where tf2_ros is installed, and else poses with covariance; no others, which may be
+anybody's. The topic is heard by best effort if any of its publishers offers no more. A Twist has
+no stamp, so the commands are followed by when they were published.
+
+`subgoal_node` is to hear `planning_map` as its `map`, and its `episode_gap` is to be
+`longest_silence`, for there is a pose only where a cell is entered. `docs/raw_bags.md` tells how
+cells and actions are made.
 """
 
 
@@ -51,6 +88,7 @@ class _Page:
 
     name: str
     summary: str
+    notes: str
     inputs: Sequence[NodeTopic]
     outputs: Sequence[NodeTopic]
     services: Sequence[NodeService]
@@ -61,6 +99,7 @@ _PAGES = (
     _Page(
         "subgoal_node",
         subgoal_node.SubgoalNode.__doc__ or "",
+        _ON_SUBGOALS,
         subgoal_node.INPUTS,
         subgoal_node.OUTPUTS,
         subgoal_node.SERVICES,
@@ -69,6 +108,7 @@ _PAGES = (
     _Page(
         "discretiser_node",
         discretiser_node.DiscretiserNode.__doc__ or "",
+        _ON_DISCRETISING,
         discretiser_node.INPUTS,
         discretiser_node.OUTPUTS,
         (),
@@ -84,7 +124,7 @@ def reference() -> str:
 
 def _section(page: _Page) -> str:
     first_line = page.summary.partition("\n")[0]
-    parts = [f"## {page.name}\n\n{first_line}\n"]
+    parts = [f"## {page.name}\n\n{first_line}\n\n{page.notes}"]
     parts.append("### Heard\n\n" + _topic_table(page.inputs))
     parts.append("### Published\n\n" + _topic_table((*page.outputs, DIAGNOSTICS)))
     if page.services:
