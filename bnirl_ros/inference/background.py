@@ -69,7 +69,9 @@ class BackgroundInference(Worker):
         self._thread.start()
 
     def use_map(self, grid_map: GridMap) -> None:
-        """Put all observations on this map from now on."""
+        """Put all observations on this map from now on; the same again changes nothing."""
+        if self._grid_map and grid_map.is_same_as(self._grid_map):
+            return
         self._update(_grid_map=grid_map, _changed=True)
 
     def use_settings(self, settings: Settings) -> None:
