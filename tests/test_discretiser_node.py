@@ -309,6 +309,20 @@ def test_an_intent_counts_where_the_robot_is_held_up(
 # What it cannot take, and what it does then
 
 
+def test_nothing_is_heard_before_somebody_hears_of_it(
+    start: Callable[..., NodeProcess], peer: Peer
+) -> None:
+    node = Watched(start("discretiser_node"), peer, "discretiser_node")
+    poses = amcl()
+    publisher = peer.node.create_publisher(message_class(poses[0][2].TYPE), "/amcl_pose", RELIABLE)
+    node.until_health(
+        "it waits", state="waiting for a subscriber of pose and the topic of source and a map"
+    )
+    assert not publisher.get_subscription_count()
+    peer.listen(message_class("geometry_msgs/msg/PoseStamped"), "/pose", RELIABLE)
+    peer.until(publisher.get_subscription_count, "a subscriber of the robot's poses")
+
+
 def test_a_source_that_tells_no_motion_is_told_and_waited_for(
     discretiser: Callable[..., Discretised], peer: Peer
 ) -> None:

@@ -119,7 +119,7 @@ class DiscretiserNode(ManagedNode):
     """Makes poses, actions and a planning map of what a robot publishes anyway.
 
     The topics of the motion are looked for until they are there, since their types tell what to
-    hear. All that is done with it is in `LiveMotion`.
+    hear. All that is made of them is made by `LiveMotion`.
     """
 
     def __init__(self) -> None:
@@ -142,6 +142,7 @@ class DiscretiserNode(ManagedNode):
         self._patience: float = values["transform_patience"]
         self._outputs = self.advertise(OUTPUTS, _PUBLISHER_DEPTH)
         self._followed = ""  # the topic that is, in words
+        self._is_heard = False  # whether anybody has heard of the poses
         self._sought: dict[str, str] = {}  # topics that are not heard yet, by their parameters
         self._refusals: dict[str, str] = {}  # why one that is there cannot be taken
         self._pending: deque[tuple[float, RawPose]] = deque()  # for tf; when it came, and what
@@ -188,7 +189,8 @@ class DiscretiserNode(ManagedNode):
         motion = self._motion
         faults = motion.faults + self.faults
         self.tell(faults)
-        waits_for = [
+        waits_for = [] if self._is_heard else ["a subscriber of pose"]
+        waits_for += [
             f"the topic of {role}" + (f", {topic}" if topic else "")
             for role, topic in self._sought.items()
         ]
@@ -211,7 +213,14 @@ class DiscretiserNode(ManagedNode):
         )
 
     def _look_for_topics(self) -> None:
-        """Hear what is sought and there by now; looking ends when all is found."""
+        """Hear what is sought and there by now; looking ends when all is found.
+
+        Nothing is heard before somebody hears of it: a replay waits for this node, which so waits
+        for the next one, and nothing is lost on the way.
+        """
+        self._is_heard = self._is_heard or self._outputs["pose"].get_subscription_count() > 0
+        if not self._is_heard:
+            return
         types = dict(self.get_topic_names_and_types())
         for role, topic in tuple(self._sought.items()):
             found = self._named(role, topic, types) if topic else self._automatic(types)

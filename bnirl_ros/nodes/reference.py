@@ -71,10 +71,11 @@ The motion is that on the topic that `source` names:
 | tf2_msgs/msg/TFMessage | tf2_ros; followed is `base_frame` |
 | geometry_msgs/msg/TwistStamped, geometry_msgs/msg/Twist | `start` |
 
-The node waits until the topic is there and asks for its type. If `source` is empty it takes
-odometry where tf2_ros is installed, and else poses with covariance; no others, which may be
-anybody's. The topic is heard by best effort if any of its publishers offers no more. A Twist has
-no stamp, so the commands are followed by when they were published.
+The node waits until somebody hears `pose`, so that nothing is lost, and until the topic is there,
+whose type it asks for. If `source` is empty it takes odometry where tf2_ros is installed, and else
+poses with covariance; no others, which may be anybody's. The topic is heard by best effort if any
+of its publishers offers no more. A Twist has no stamp, so the commands are followed by when they
+were published.
 
 `subgoal_node` is to hear `planning_map` as its `map`, and its `episode_gap` is to be
 `longest_silence`, for there is a pose only where a cell is entered. `docs/raw_bags.md` tells how
