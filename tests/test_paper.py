@@ -569,9 +569,9 @@ def bnirl(capsys: pytest.CaptureFixture[str]) -> Iterator[Command]:
 
 
 def test_the_command_offers_what_there_is() -> None:
-    assert (*PARTS, "all") == cli.REPRODUCIBLE
+    assert (*PARTS, "all") == cli.reproduce.REPRODUCIBLE
     plan = Plan()
-    options = cli._parser().parse_args(["reproduce"])
+    options = cli.parser().parse_args(["reproduce"])
     assert (options.part, options.runs, options.iterations) == ("all", plan.runs, plan.iterations)
     assert Parameters(options.alpha, options.eta) == plan.parameters
 

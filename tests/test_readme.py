@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from bnirl_ros.bags.demonstration import read_demonstration
-from bnirl_ros.cli import _parser
+from bnirl_ros.cli import parser
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.demonstrations.placement import place
 from bnirl_ros.experiments.scenarios import PAPER_LOOP
@@ -78,10 +78,10 @@ def test_commands_parse(arguments: list[str], capsys: pytest.CaptureFixture[str]
         return
     if "--help" in arguments:
         with pytest.raises(SystemExit, match=r"^0$"):
-            _parser().parse_args(arguments)
+            parser().parse_args(arguments)
         assert "usage" in capsys.readouterr().out
         return
-    assert callable(_parser().parse_args(arguments).run)
+    assert callable(parser().parse_args(arguments).run)
 
 
 def test_there_are_commands_to_parse() -> None:

@@ -1,0 +1,7 @@
+"""python -m bnirl_ros.cli"""
+
+import sys
+
+from bnirl_ros.cli import main
+
+sys.exit(main())

@@ -1,0 +1,44 @@
+"""`bnirl infer`: from a file to the three result files and a table."""
+
+from __future__ import annotations
+
+import argparse
+from threading import Thread
+from typing import Any
+
+from bnirl_ros.cli.inference import (
+    add_inference,
+    inferred,
+    read,
+    remappings_of,
+    settings_of,
+    told_of,
+)
+
+
+def add(commands: Any) -> None:
+    """The subcommand and its options."""
+    parser = commands.add_parser("infer", help="infer the subgoals of a recorded demonstration")
+    add_inference(parser)
+    parser.set_defaults(run=_infer, command=parser)
+
+
+def _infer(options: argparse.Namespace) -> int:
+    """`bnirl infer`: from a file to the three result files and a table."""
+    settings = settings_of(options.command, options)
+    remappings = remappings_of(options.command, options.remap)
+
+    from bnirl_ros.inference.summary import summarise
+    from bnirl_ros.views.map_panel import import_matplotlib
+    from bnirl_ros.views.results import check_writable, write_results
+    from bnirl_ros.views.tables import report
+
+    demonstration, grid_map, damage = read(options, settings, remappings)
+    check_writable(options.out)
+    Thread(target=import_matplotlib, daemon=True).start()  # while the chains leave the GIL alone
+    posterior = inferred(demonstration, grid_map, settings)
+    summary = summarise(posterior, grid_map)
+    written = write_results(options.out, posterior, summary, grid_map, settings)
+    print(report(summary))
+    print(f"Written: {', '.join(str(file) for file in written)}")
+    return told_of(damage)
