@@ -29,7 +29,7 @@ endif
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 unexport AMENT_PREFIX_PATH PYTHONPATH PYTHONHOME RMW_IMPLEMENTATION
 
-.PHONY: help demo test lint unit bags reference benchmark study reproduce venv clean
+.PHONY: help demo test lint unit colcon bags reference benchmark study reproduce venv clean
 
 help:  ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -46,6 +46,9 @@ lint: venv  ## Check style and types
 
 unit: venv  ## Run the tests, without the checks of style and types
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+colcon:  ## Build, test and run the package with colcon, in a folder that is thrown away
+	@scripts/colcon $(PYTEST_ARGS)
 
 bags: venv  ## Make the bags in bags/ again
 	$(BIN)/python -m bnirl_ros.experiments.make_bags --overcooked "$(OVERCOOKED)" \

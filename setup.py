@@ -76,7 +76,6 @@ setup(
     maintainer="bnirl_ros maintainers",
     maintainer_email="bnirl-ros@example.com",
     license="Apache-2.0",
-    license_files=["LICENSE"],
     keywords=["ROS", "inverse reinforcement learning", "learning from demonstration"],
     classifiers=[
         "Intended Audience :: Science/Research",
