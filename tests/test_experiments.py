@@ -60,10 +60,12 @@ EPISODES = {
     "turtle_waypoints": 1,
 }
 NAMES = list(EPISODES)
+COMMANDS = "turtle_commands"
+ALL = [*NAMES, COMMANDS]
 
 # Those made of recordings can be made again only where these are.
 NEEDS = {"paper": (), "overcooked": needs_recordings, "turtle": needs_shared_bags}
-REMAKABLE = [pytest.param(name, marks=NEEDS[name.partition("_")[0]]) for name in NAMES]
+REMAKABLE = {name: pytest.param(name, marks=NEEDS[name.partition("_")[0]]) for name in ALL}
 
 CSV = """\
 episode,t,x,y,action,interact_ok
@@ -108,6 +110,8 @@ def make(name: str, out: Path) -> Path:
         return make_bags.make_scenario_bag(SCENARIOS[name], out)
     if name == "turtle_waypoints":
         return make_bags.make_turtle_bag(TURTLE, out)
+    if name == COMMANDS:
+        return make_bags.make_turtle_commands_bag(TURTLE, out)
     bag, _ = make_bags.make_overcooked_bag(RECORDINGS, name.removeprefix("overcooked_"), out)
     return bag
 
@@ -219,16 +223,17 @@ def test_the_map_of_a_shipped_bag_is_latched_and_first(name: str) -> None:
     assert (first.topic, first.log_time) == ("/map", BEGINNING)
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name not in SCENARIOS])
+@pytest.mark.parametrize("name", [name for name in ALL if name not in SCENARIOS])
 def test_recordings_of_others_come_with_their_licence(name: str) -> None:
     licence = overcooked.LICENCE
-    if name == "turtle_waypoints":
+    notices = {"turtle_waypoints": turtle.NOTICE, COMMANDS: turtle.COMMANDS_NOTICE}
+    if name in notices:
         # The recording's licence is that of this package too.
-        licence = turtle.NOTICE + (BAGS.parent / "LICENSE").read_text(encoding="utf-8")
+        licence = notices[name] + (BAGS.parent / "LICENSE").read_text(encoding="utf-8")
     assert (BAGS / name / "LICENSE").read_text(encoding="utf-8") == licence
 
 
-@pytest.mark.parametrize("name", REMAKABLE)
+@pytest.mark.parametrize("name", [REMAKABLE[name] for name in NAMES])
 def test_a_shipped_bag_holds_what_it_was_made_of(name: str) -> None:
     demonstration, grid_map = original(name)
     recorded = read_demonstration(BAGS / name, {})
@@ -240,8 +245,18 @@ def test_a_shipped_bag_holds_what_it_was_made_of(name: str) -> None:
     assert recorded.grid_map.frame_id == grid_map.frame_id
 
 
+def test_the_shipped_commands_are_the_recorded_ones() -> None:
+    bag = Bag(BAGS / COMMANDS)
+    shipped = list(bag.messages())
+    assert (bag.warnings, bag.damage, len(shipped)) == ([], None, 8886)
+    (topic,) = bag.topics()
+    assert (topic.name, topic.type_name) == (turtle.TOPIC, turtle.TYPE)
+    if TURTLE.is_dir():
+        assert shipped == list(Bag(TURTLE).messages())
+
+
 @needs_the_same_zstd
-@pytest.mark.parametrize("name", REMAKABLE)
+@pytest.mark.parametrize("name", REMAKABLE.values())
 def test_bags_can_be_made_again_byte_for_byte(name: str, tmp_path: Path) -> None:
     bag = make(name, tmp_path)
     shipped = {path.name: path.read_bytes() for path in (BAGS / name).iterdir()}
@@ -369,8 +384,9 @@ def test_missing_recordings_are_named_and_the_rest_is_made(
 def test_a_recording_of_the_turtle_needs_its_licence(tmp_path: Path) -> None:
     (file,) = TURTLE.glob("*.mcap")
     shutil.copy(file, tmp_path)
-    with pytest.raises(InputError, match=r"LICENSE: cannot be read; put the recording's licence"):
-        make_bags.make_turtle_bag(tmp_path, tmp_path / "bags")
+    for make_it in (make_bags.make_turtle_bag, make_bags.make_turtle_commands_bag):
+        with pytest.raises(InputError, match=r"LICENSE: cannot be read; put the recording's lice"):
+            make_it(tmp_path, tmp_path / "bags")
     assert not (tmp_path / "bags").exists()
 
 
@@ -382,7 +398,7 @@ def test_the_command_leaves_other_files_alone(tmp_path: Path) -> None:
     sources = ["--overcooked", str(RECORDINGS), "--turtle", str(TURTLE)]
     assert make_bags.main([*sources, "--out", str(tmp_path)]) == 0
     assert (tmp_path / "paper_loop" / "NOTES").is_file()
-    assert {path.name for path in tmp_path.iterdir()} == set(NAMES)
+    assert {path.name for path in tmp_path.iterdir()} == set(ALL)
 
 
 # The printed sum

@@ -68,18 +68,32 @@ def make_turtle_bag(source: Path, out: Path) -> Path:
         InputError: the recording or its licence is missing or wrong.
     """
     demonstration, grid_map = turtle.read_turtle(source)
+    licence = _licence_of_turtle(source)
+    bag = out / "turtle_waypoints"
+    write_demonstration(bag, demonstration, grid_map, turtle.STEP)
+    (bag / LICENCE_FILE).write_text(turtle.NOTICE + licence, encoding="utf-8")
+    return bag
+
+
+def make_turtle_commands_bag(source: Path, out: Path) -> Path:
+    """Write the bag `turtle_commands`, the recorded commands themselves, as `make_turtle_bag`."""
+    licence = _licence_of_turtle(source)
+    bag = out / "turtle_commands"
+    turtle.copy_commands(source, bag)
+    (bag / LICENCE_FILE).write_text(turtle.COMMANDS_NOTICE + licence, encoding="utf-8")
+    return bag
+
+
+def _licence_of_turtle(source: Path) -> str:
+    """The licence of the recording, which has to be there."""
     licence = source / LICENCE_FILE
     try:
-        text = licence.read_text(encoding="utf-8")
+        return licence.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
         raise InputError(
             f"{licence}: cannot be read; put the recording's licence there, it has to go with the "
             "bag"
         ) from None
-    bag = out / "turtle_waypoints"
-    write_demonstration(bag, demonstration, grid_map, turtle.STEP)
-    (bag / LICENCE_FILE).write_text(turtle.NOTICE + text, encoding="utf-8")
-    return bag
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -106,8 +120,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for layout in LAYOUTS:
             bag, episodes = make_overcooked_bag(options.overcooked, layout, options.out)
             print(f"{bag}: {episodes} episodes, {bag_size(bag)} bytes")
-        bag = make_turtle_bag(options.turtle, options.out)
-        print(f"{bag}: 1 episode, {bag_size(bag)} bytes")
+        for make in (make_turtle_bag, make_turtle_commands_bag):
+            bag = make(options.turtle, options.out)
+            print(f"{bag}: 1 episode, {bag_size(bag)} bytes")
     except InputError as error:
         print(f"make_bags: {error}", file=sys.stderr)
         return 1

@@ -14,7 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from bnirl_ros.bags.cdr import decode
+from bnirl_ros.bags.qos import RELIABLE
 from bnirl_ros.bags.reader import Bag
+from bnirl_ros.bags.writer import BagWriter
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.demonstrations.motion import fill_jumps
 from bnirl_ros.demonstrations.raw_messages import Command
@@ -42,16 +44,28 @@ STEP = 0.5
 """Time between two poses in the bag [s], our choice: at the robot's own pace each of its halts, of
 2 s and more, would end an episode."""
 
-NOTICE = """\
+_NOTICE = """\
 This bag was converted from a recording of a turtlesim robot that its author, a student, had driven
 round six waypoints in September 2025. The recording names neither its author nor a copyright
-holder. Its commands (geometry_msgs/Twist) were integrated to a drive, the drive was put on a grid,
-and the changes of cell became poses and actions; the map is the open square of turtlesim.
+holder. {}
 
 The recording is under the Apache License 2.0, and so is this bag:
 
 """
+
+NOTICE = _NOTICE.format(
+    """\
+Its commands (geometry_msgs/Twist) were integrated to a drive, the drive was put on a grid,
+and the changes of cell became poses and actions; the map is the open square of turtlesim."""
+)
 """What goes before the licence of the recording: whose it is, and what was changed."""
+
+COMMANDS_NOTICE = _NOTICE.format(
+    """\
+All its commands (geometry_msgs/Twist) are here, byte for byte, with the times at which
+they were recorded; what was written anew is the file around them."""
+)
+"""The same for a bag of the commands themselves."""
 
 
 def read_turtle(folder: Path, resolution: float = 0.5) -> tuple[Demonstration, GridMap]:
@@ -111,6 +125,23 @@ def read_commands(folder: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np
     if not np.isfinite(commands).all() or not commands:
         raise InputError(f"{folder}: has no commands, or not all are numbers; record it again")
     return (np.array(stamps) - stamps[0]) / 1e9, np.array(commands, dtype=np.float64)
+
+
+def copy_commands(folder: Path, bag: Path) -> None:
+    """Write the recorded commands as they are, each with its log time, into another bag.
+
+    Args:
+        folder: the recording, a rosbag2 folder.
+        bag: the folder to write, whose name is the bag's; what is there as a bag is replaced.
+
+    Raises:
+        InputError: the recording is missing, damaged or another one, or the bag cannot be written.
+    """
+    read_commands(folder)  # refuses what is none of the turtle's
+    with BagWriter(bag, overwrite=True) as writer:
+        writer.add_topic(TOPIC, TYPE, RELIABLE)
+        for raw in Bag(folder).messages([TOPIC]):
+            writer.write_encoded(TOPIC, raw.data, raw.log_time)
 
 
 def drive(
