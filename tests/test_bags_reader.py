@@ -295,7 +295,8 @@ def test_a_bad_file_of_a_split_bag_does_not_cost_the_others(tmp_path: Path) -> N
         (b"", "is empty; record it again"),
         (b"episode,x,y,action\n", "is no MCAP file; name a rosbag2 folder"),
         (b"\x28\xb5\x2f\xfd1234", "unpack it with `zstd -d`"),
-        (b"SQLite format 3\0rest", "convert it with `ros2 bag convert`"),
+        (b"SQLite format 3\0rest", "convert it with `ros2 bag convert` or `rosbags-convert`"),
+        (b"#ROSBAG V2.0\nrest", "is a bag of ROS 1; convert it with `rosbags-convert`"),
     ],
 )
 def test_what_is_no_mcap_file_is_said_in_words(

@@ -27,6 +27,9 @@ from bnirl_ros.errors import InputError
 _RUN_SIZE = 2**20  # bytes of messages outside chunks that are read at once
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _SQLITE_MAGIC = b"SQLite format 3\0"
+_ROS_1_MAGIC = b"#ROSBAG V2.0\n"
+# The second comes with rosbags, which this package needs: there may be no ROS.
+_CONVERTERS = "`ros2 bag convert` or `rosbags-convert`"
 
 
 @dataclass(frozen=True)
@@ -161,7 +164,7 @@ class Bag:
         if not here:
             raise InputError(
                 f"{path}: holds no .mcap file; name a bag recorded with `-s mcap`, or convert one "
-                "with `ros2 bag convert`"
+                f"with {_CONVERTERS}"
             )
         self.warnings.append(f"{warning}; its .mcap files are read in the order of their names")
         return here
@@ -376,7 +379,9 @@ def _refusal(path: Path, beginning: bytes) -> InputError:
     elif beginning.startswith(_ZSTD_MAGIC):
         problem = "is compressed as a whole; unpack it with `zstd -d`"
     elif beginning.startswith(_SQLITE_MAGIC):
-        problem = "is an SQLite bag; convert it with `ros2 bag convert`"
+        problem = f"is an SQLite bag; convert it with {_CONVERTERS}"
+    elif beginning.startswith(_ROS_1_MAGIC):
+        problem = "is a bag of ROS 1; convert it with `rosbags-convert`"
     else:
         problem = "is no MCAP file; name a rosbag2 folder or an .mcap file"
     return InputError(f"{path}: {problem}")
