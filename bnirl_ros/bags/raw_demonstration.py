@@ -173,7 +173,7 @@ def read_raw_demonstration(
     if not len(recording.actions):
         raise InputError(
             f"{path}: by {motion.words} the robot never leaves a cell of {planning.resolution:g} m"
-            "; take a lower planning resolution, or another source"
+            "; take smaller cells (planning_resolution), or another source"
         )
     words = (
         f"{len(recording.pose_stamps)} visits of cells of {planning.resolution:g} m from "

@@ -33,8 +33,9 @@ def planning_map(
     if not coarsened.through_walls:
         return coarsened.grid_map, ""
     return coarsened.grid_map, (
-        f"planning map: {coarsened.through_walls} pairs of free cells have a wall between them "
-        "that cells so large cannot show; take a lower planning resolution"
+        "planning map: pairs of free cells with a wall between them that cells of "
+        f"{coarsened.grid_map.resolution:g} m cannot show: {coarsened.through_walls}; take "
+        "smaller cells (planning_resolution)"
     )
 
 
@@ -78,7 +79,7 @@ def on_opened(
     closed = {(x, y) for x, y in planning.cells_of(where_free).tolist()} & set(opened)
     if closed:
         sentence += (
-            f"; {len(closed)} of them only the coarsening had closed, for which the robot radius "
-            "or the planning resolution is too large"
+            f"; {len(closed)} of them only the coarsening had closed, for which robot_radius or "
+            "planning_resolution is too large"
         )
     return sentence
