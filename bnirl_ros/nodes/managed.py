@@ -78,6 +78,7 @@ class ManagedNode(LifecycleNode):
         self.configured = False
         self._told: dict[str, int] = {}  # with how many digits each fault was told
         self._failure = ""  # why the last transition was not made
+        self._is_starting = False  # by itself, so that whoever started it is told what fails
         self._heard: list[Any] = []
         self._advertised: list[Any] = []
         self._taken_when_configured = {
@@ -123,9 +124,11 @@ class ManagedNode(LifecycleNode):
         """
         if not self.get_parameter(AUTOSTART.name).value:
             return
+        self._is_starting = True
         for trigger in (self.trigger_configure, self.trigger_activate):
             if trigger() is not TransitionCallbackReturn.SUCCESS:
                 raise InputError(self._failure)
+        self._is_starting = False
 
     def close(self) -> None:
         """Let go of everything, in whatever state the node is."""
@@ -196,7 +199,7 @@ class ManagedNode(LifecycleNode):
         self.active = True
         outcome = self._tried("activated", self.activate)
         if outcome is not TransitionCallbackReturn.SUCCESS:
-            self._be_deaf()
+            self.on_deactivate(state)
         return outcome
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -220,12 +223,12 @@ class ManagedNode(LifecycleNode):
         return super().on_error(state)
 
     def _tried(self, done: str, transition: Callable[[], None]) -> TransitionCallbackReturn:
-        """What came of a part of a transition; a fault is logged unless `start` tells of it."""
+        """What came of a part of a transition; a user's mistake is logged unless `start` tells."""
         try:
             transition()
         except InputError as error:
             self._failure = str(error)
-            if not self.get_parameter(AUTOSTART.name).value:
+            if not self._is_starting:
                 self.get_logger().error(f"cannot be {done}: {error}")
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
