@@ -72,8 +72,13 @@ def assignment_markers(summary: Summary, grid_map: GridMap, stamp_ns: int) -> Ma
     header = header_of(grid_map.frame_id, stamp_ns)
     markers = [delete_all(header)]
     unexplained = [0] if (summary.rank_of == 0).any() else []
+    height, width = grid_map.free.shape
+    shape = (width, height, len(STEPS))
     for rank in unexplained + [subgoal.rank for subgoal in summary.subgoals]:
-        pairs = np.unique(summary.observations[summary.rank_of == rank, 1:].reshape(-1, 3), axis=0)
+        own = summary.observations[summary.rank_of == rank, 1:].reshape(-1, 3)
+        # As numbers: to compare rows numpy takes long, and holds all other threads up meanwhile.
+        numbers = np.unique(np.ravel_multi_index(tuple(own.T), shape))
+        pairs = np.column_stack(np.unravel_index(numbers, shape))
         ends = grid_map.centres_of(_lines(pairs).reshape(-1, 2))
         markers.append(
             Marker(
