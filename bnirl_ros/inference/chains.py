@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from threading import Event
 
 import numpy as np
@@ -12,6 +10,7 @@ import numpy as np
 from bnirl_ros.inference.draws import Draws
 from bnirl_ros.inference.samplers import Model, sampler_of
 from bnirl_ros.inference.settings import Settings
+from bnirl_ros.threads import workers
 
 _SWEEPS_AT_ONCE = 50  # between two looks at whether to stop
 
@@ -57,7 +56,7 @@ def run_chains(
                 progress(len(part) * thin)
 
     seeds = np.random.SeedSequence(settings.seed).spawn(settings.chains)
-    with ThreadPoolExecutor(min(settings.chains, os.cpu_count() or 1)) as threads:
+    with workers(settings.chains) as threads:
         try:
             list(threads.map(run_chain, range(settings.chains), seeds))
         except BaseException:

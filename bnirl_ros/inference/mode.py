@@ -7,8 +7,6 @@ carries stray subgoals with an observation or two.
 from __future__ import annotations
 
 import math
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,6 +16,7 @@ from numba import njit
 
 from bnirl_ros.inference.draws import Draws
 from bnirl_ros.model.mixture import SubgoalMixture
+from bnirl_ros.threads import workers
 
 _GAIN = 1e-9  # nats; a smaller gain is rounding, and following it could go round in a circle
 _REPLACEMENTS = 8  # candidates tried in a partition's subgoal's place, the most likely ones
@@ -46,7 +45,7 @@ def posterior_mode(mixture: SubgoalMixture, chains: Draws) -> Mode:
         chains: draws with leading axes (chain, draw).
     """
     best = chains.log_joint.argmax(axis=1)
-    with ThreadPoolExecutor(min(len(best), os.cpu_count() or 1)) as threads:
+    with workers(len(best)) as threads:
         modes = threads.map(
             lambda chain, draw: ascend(
                 mixture, chains.partition_of[chain, draw], chains.subgoal_of[chain, draw]

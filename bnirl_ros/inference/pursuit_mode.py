@@ -8,8 +8,6 @@ Viterbi algorithm, all pursuits of one subgoal at once, and subgoals of few purs
 from __future__ import annotations
 
 import math
-import os
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import numpy.typing as npt
@@ -35,6 +33,7 @@ from bnirl_ros.inference.pursuit_gibbs import (
     urn_weights,
 )
 from bnirl_ros.model.pursuits import ALPHA, ELSEWHERE, ETA, PRIORS, PursuitModel
+from bnirl_ros.threads import workers
 
 _GAIN = 1e-9  # nats; a smaller gain is rounding
 _BLOCKS = (np.int64(1024), np.int64(32))  # observations that the Viterbi algorithm takes at once
@@ -55,7 +54,7 @@ def posterior_mode(model: PursuitModel, chains: Draws) -> Mode:
     """
     parameters = np.median(chains.parameters.reshape(-1, len(PRIORS)), axis=0)
     best = chains.log_joint.argmax(axis=1)
-    with ThreadPoolExecutor(min(len(best), os.cpu_count() or 1)) as threads:
+    with workers(len(best)) as threads:
         modes = threads.map(
             lambda chain, draw: ascend(model, chains.subgoal_of[chain, draw], parameters),
             range(len(best)),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -15,6 +13,7 @@ from bnirl_ros.inference.posterior import Posterior, model_of, posterior_of
 from bnirl_ros.inference.samplers import sampler_of
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.maps.grid_map import GridMap
+from bnirl_ros.threads import workers
 
 CAPACITY = 128
 """Draws kept of each chain; even, and enough for R-hat to tell 1.05 from 1."""
@@ -88,7 +87,7 @@ class RunningPosterior:
             state, generator = self._states[chain], self._generators[chain]
             self._sampler.advance(self._model, state, generator, part, self._thin)
 
-        with ThreadPoolExecutor(min(len(self._states), os.cpu_count() or 1)) as threads:
+        with workers(len(self._states)) as threads:
             list(threads.map(run_chain, range(len(self._states))))
         self.sweeps += (end - self._kept) * self._thin
         self._kept = end

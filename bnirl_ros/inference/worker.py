@@ -5,6 +5,7 @@ from __future__ import annotations
 from threading import Condition, Thread
 
 from bnirl_ros.demonstrations.recording import Recorder
+from bnirl_ros.threads import compute_behind_others
 
 
 class Worker:
@@ -33,7 +34,7 @@ class Worker:
         self._closed = False
         self._at_work = False
         self._wake = Condition()
-        self._thread = Thread(target=self._run, name=name, daemon=True)
+        self._thread = Thread(target=self._begin, name=name, daemon=True)
 
     def observations_arrived(self) -> None:
         """There is something new in the recorder."""
@@ -44,6 +45,10 @@ class Worker:
         """End the thread, as soon as what is under way is done."""
         self._update(_closed=True)
         self._thread.join()
+
+    def _begin(self) -> None:
+        compute_behind_others()
+        self._run()
 
     def _run(self) -> None:
         raise NotImplementedError

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 import numpy.typing as npt
 
 from bnirl_ros.mdp.goals import Goals
 from bnirl_ros.mdp.process import TOLERANCE, MarkovDecisionProcess, checked_states
 from bnirl_ros.mdp.reward_values import action_values, optimal_values
+from bnirl_ros.threads import workers
 
 _GOALS_AT_ONCE = 16  # lanes: enough to fill the vector units, few enough to stay in the caches
 
@@ -62,7 +60,7 @@ def goal_values(
         for kind in (np.flatnonzero(all_goals.sizes == 1), np.flatnonzero(all_goals.sizes > 1))
         for start in range(0, len(kind), _GOALS_AT_ONCE)
     ]
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
+    with workers(len(batches)) as threads:
         try:
             list(threads.map(solve, batches))
         except BaseException:
