@@ -25,6 +25,7 @@ from bnirl_ros.inference.summary import Summary, nothing_found
 from bnirl_ros.inference.watching import BackgroundWatch
 from bnirl_ros.limits import Limits
 from bnirl_ros.maps import FeatureLayer, GridMap, load_features, with_features
+from bnirl_ros.nodes.drawing import Drawing
 from bnirl_ros.nodes.managed import LATCHED, ManagedNode, publish, serve
 from bnirl_ros.nodes.parameters import NodeParameter, declare_settings
 from bnirl_ros.nodes.topics import NodeService, NodeTopic
@@ -181,6 +182,7 @@ class SubgoalNode(ManagedNode):
         self._recorder = Recorder(values["waiting_limit"])
         self._shown: dict[str, Message] = {}  # the last messages on what is pursued now
         self._result: Result | None = None
+        self._drawing = Drawing()
         self._assignments_due = False
         self._assignments_at = -math.inf  # [s] by the machine's own time
         self._paused = False
@@ -202,11 +204,13 @@ class SubgoalNode(ManagedNode):
     def deactivate(self) -> None:
         """Let the inference rest."""
         self._inference.pause(True)
+        self._drawing.forget()
 
     def clean_up(self) -> None:
         """End the threads, and answer who waits for an inference."""
         self._inference.close()
         self._watch.close()
+        self._drawing.close()
         self._answer()
 
     def health(self) -> Health:
@@ -218,7 +222,7 @@ class SubgoalNode(ManagedNode):
         result = self._result
         summary = result.summary if result else None
         observations = len(result.placement.demonstration) if result else 0
-        idle = self._inference.idle and self._watch.idle
+        idle = self._inference.idle and self._watch.idle and self._drawing.idle
         return Health(
             subject="inference",
             state="paused" if self._paused else "settled" if idle else "inferring",
@@ -339,6 +343,7 @@ class SubgoalNode(ManagedNode):
         self._answer()
         if not self.active:
             return
+        self._drawing.publish()
         result = self._inference.take_result()
         if result is not None:
             self._publish(result)
@@ -381,12 +386,14 @@ class SubgoalNode(ManagedNode):
 
     def _send(self, name: str, view: View, result: Result) -> None:
         summary = result.summary or nothing_found(result.grid_map)
-        publish(self._outputs[name], view(summary, result.grid_map, self.stamp()))
+        stamp = self.stamp()
+        self._drawing.ask(self._outputs[name], lambda: view(summary, result.grid_map, stamp))
 
     def _send_saved_waypoints(self) -> None:
         """Publish the waypoints of a file, if one was given: they stand in for a posterior."""
         if self._saved_waypoints:
-            publish(self._outputs["waypoints"], path_of(self._saved_waypoints, self.stamp()))
+            waypoints, stamp = self._saved_waypoints, self.stamp()
+            self._drawing.ask(self._outputs["waypoints"], lambda: path_of(waypoints, stamp))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
