@@ -160,18 +160,22 @@ class ManagedNode(LifecycleNode):
 
     def hear(
         self, topic: str, type_name: str, callback: Callable[..., None], qos: QoSProfile
-    ) -> None:
-        """Hear a topic until the node is deactivated; lost messages are counted."""
-        self._heard.append(
-            self.create_subscription(
-                message_class(type_name),
-                topic,
-                callback,
-                qos,
-                event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost),
-                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-            )
+    ) -> Any:
+        """Hear a topic until the node is deactivated; lost messages are counted.
+
+        Returns:
+            The subscription.
+        """
+        subscription = self.create_subscription(
+            message_class(type_name),
+            topic,
+            callback,
+            qos,
+            event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
+        self._heard.append(subscription)
+        return subscription
 
     def tell(self, faults: Mapping[str, int]) -> None:
         """Log the first of a fault's messages, ten, a hundred...: no flood, and no silence."""

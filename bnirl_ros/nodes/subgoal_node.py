@@ -28,6 +28,7 @@ from bnirl_ros.maps import FeatureLayer, GridMap, load_features, with_features
 from bnirl_ros.nodes.drawing import Drawing
 from bnirl_ros.nodes.managed import LATCHED, ManagedNode, publish, serve
 from bnirl_ros.nodes.parameters import NodeParameter, declare_settings
+from bnirl_ros.nodes.subscriptions import take_together
 from bnirl_ros.nodes.topics import NodeService, NodeTopic
 from bnirl_ros.views.belief import belief_grid
 from bnirl_ros.views.diagnostics import Health, inference_values
@@ -197,9 +198,11 @@ class SubgoalNode(ManagedNode):
         if self._result:
             self._publish(self._result)
         by_name = {"pose": self._on_pose, "action": self._on_action, "map": self._on_map}
+        heard = {}
         for topic in INPUTS:
             qos = LATCHED if topic.latched else QoSProfile(depth=self._depth)
-            self.hear(topic.name, topic.type_name, by_name[topic.name], qos)
+            heard[topic.name] = self.hear(topic.name, topic.type_name, by_name[topic.name], qos)
+        take_together([heard["pose"], heard["action"]])
 
     def deactivate(self) -> None:
         """Let the inference rest."""
