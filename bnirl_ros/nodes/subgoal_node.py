@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import sys
 import time
@@ -368,6 +369,10 @@ class SubgoalNode(ManagedNode):
         self._answers = [(request, done) for request, done in self._answers if not done.done()]
 
     def _publish(self, result: Result) -> None:
+        if result.summary and not gc.get_freeze_count():
+            # All modules and kernels are there now, and stay: to look through them for what is not
+            # needed any more would hold everybody up for tens of milliseconds.
+            gc.freeze()
         self._result = result
         self._send("subgoals", subgoal_markers, result)
         if result.summary or not self._saved_waypoints:
