@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib
 import signal
+import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -22,9 +24,12 @@ from demonstration_support import (
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from bnirl_ros.nodes.conversion import message_class, to_ros
+from bnirl_ros.nodes.managed import ManagedNode
+from bnirl_ros.views.diagnostics import Health
 from bnirl_ros.views.stamped import time_of
 from ros_support import (
     LATCHED,
+    PATIENCE,
     RELIABLE,
     NodeProcess,
     Peer,
@@ -195,3 +200,46 @@ def test_a_clock_that_jumps_back_begins_a_new_episode(start: StartNode, peer: Pe
     assert health["drops"] == "0"
     node.until_shown(CORNER_PLACES)
     assert node.outputs["subgoals"][-1].markers[-1].header.stamp.sec == START // SECOND - 5
+
+
+class Clumsy(ManagedNode):
+    """Fails on every message, and has nothing to say."""
+
+    def configure(self, values: dict[str, Any]) -> None:
+        pass
+
+    def activate(self) -> None:
+        self.hear("pose", "geometry_msgs/msg/PoseStamped", self._fail, RELIABLE)
+
+    def clean_up(self) -> None:
+        pass
+
+    def health(self) -> Health:
+        return Health("clumsiness", "failing", "", faults=self.faults)
+
+    def _fail(self, message: Any) -> None:
+        raise ValueError(message.header.frame_id)
+
+
+def test_a_node_lives_on_when_it_fails_on_a_message(own_domain: None) -> None:
+    rclpy = importlib.import_module("rclpy")
+    executors = importlib.import_module("rclpy.executors")
+    rclpy.init()
+    node = Clumsy("clumsy", "clumsiness", ())
+    executor = executors.SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        node.start()
+        publisher = node.create_publisher(
+            message_class("geometry_msgs/msg/PoseStamped"), "pose", RELIABLE
+        )
+        for number in range(3):
+            publisher.publish(publisher.msg_type())
+            deadline = time.monotonic() + PATIENCE
+            while node.faults.total() <= number and time.monotonic() < deadline:
+                executor.spin_once(timeout_sec=0.1)
+        assert node.faults == {"message on which the node failed": 3}
+    finally:
+        executor.shutdown()
+        node.close()
+        rclpy.shutdown()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import wraps
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
@@ -47,6 +48,7 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """The last message is kept for whoever comes late."""
 
 _DIAGNOSTICS_PERIOD = 1.0  # [s]
+_LOG_PERIOD = 10.0  # [s] between two words on a failure
 
 
 class ManagedNode(LifecycleNode):
@@ -163,13 +165,15 @@ class ManagedNode(LifecycleNode):
     ) -> Any:
         """Hear a topic until the node is deactivated; lost messages are counted.
 
+        So is one on which the callback fails, and the node lives on.
+
         Returns:
             The subscription.
         """
         subscription = self.create_subscription(
             message_class(type_name),
             topic,
-            callback,
+            self._surviving(callback),
             qos,
             event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
@@ -225,6 +229,20 @@ class ManagedNode(LifecycleNode):
         """After a fault of the program in a transition: as if never configured."""
         self._end()
         return super().on_error(state)
+
+    def _surviving(self, callback: Callable[..., None]) -> Callable[..., None]:
+        @wraps(callback)  # rclpy looks at what it takes
+        def take(*arguments: Any) -> None:
+            try:
+                callback(*arguments)
+            except Exception as error:
+                self.faults["message on which the node failed"] += 1
+                self.get_logger().error(
+                    f"failed on a message: {type(error).__name__}: {error}",
+                    throttle_duration_sec=_LOG_PERIOD,
+                )
+
+        return take
 
     def _tried(self, done: str, transition: Callable[[], None]) -> TransitionCallbackReturn:
         """What came of a part of a transition; a user's mistake is logged unless `start` tells."""
