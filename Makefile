@@ -57,8 +57,9 @@ bags: venv  ## Make the bags in bags/ again
 reference: venv  ## Write docs/reference.md, the topics and parameters of the nodes
 	$(BIN)/python -m bnirl_ros.nodes.reference docs/reference.md
 
-benchmark: venv  ## Time the main job and its parts
+benchmark: venv  ## Time the main job and its parts, and load the subgoal node
 	$(BIN)/python benchmarks/main_job.py
+	$(BIN)/python benchmarks/load.py
 
 study: venv  ## Measure what the models find, into bnirl_out/study.md
 	$(BIN)/python -m bnirl_ros.experiments.study --overcooked "$(OVERCOOKED)" $(STUDY_ARGS)

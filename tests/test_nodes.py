@@ -501,6 +501,18 @@ def test_callbacks_are_served_while_inference_runs(
     assert served > 5
 
 
+def test_a_flood_of_messages_is_taken_in_whole_while_inference_runs(
+    subgoals: Callable[..., Subgoals],
+) -> None:
+    node = subgoals(sweeps=100_000_000, burn_in=0)
+    node.send([map_of_grid()], walk())
+    node.until_health("a running result", state="inferring", queue="0")
+    rounds = 125  # 6,125 messages
+    node.send(walk(rounds, start=START + 1000 * SECOND))
+    count = (1 + rounds) * OBSERVATIONS_OF_WALK
+    node.until_health("all", state="inferring", queue="0", observations=str(count), drops="0")
+
+
 # Parameters
 
 
