@@ -378,6 +378,39 @@ def test_the_command_takes_a_raw_bag(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "dwell must be below longest_silence" in capsys.readouterr().err
 
 
+def test_a_start_may_be_left_of_the_maps_origin(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = write(tmp_path / "bag", commands())
+    few = ["--sweeps", "20", "--burn-in", "5", "--chains", "1", "--out", str(tmp_path / "out")]
+    assert main(["infer", str(bag), "--start", "-.6,0.6,0", *few]) == 0
+    assert "followed from (-0.6, 0.6), 0 rad" in capsys.readouterr().out
+
+
+def test_the_command_tells_what_is_in_a_bag(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    everything = [*SOURCES["/odom"], *SOURCES["/amcl_pose"], *commands()]
+    assert main(["info", str(write(tmp_path / "bag", everything))]) == 0
+    *table, words = capsys.readouterr().out.splitlines()
+    assert [line.split() for line in table] == [
+        ["motion", "messages", "type", "topic"],
+        ["2", "14", "geometry_msgs/msg/PoseWithCovarianceStamped", "/amcl_pose"],
+        ["4", "80", "geometry_msgs/msg/Twist", "/cmd_vel"],
+        ["1", "81", "nav_msgs/msg/Odometry", "/odom"],
+        ["3", "17", "tf2_msgs/msg/TFMessage", "/tf"],
+    ]
+    assert words.startswith("bnirl infer takes the motion on topic 1, ")
+    assert main(["info", str(BAGS / "paper_loop")]) == 0
+    table = capsys.readouterr().out.splitlines()
+    assert table[1].split()[0] == "-"
+    assert table[-1] == "bnirl infer takes poses and actions"
+    goal = [("/goal_pose", 0.0, PoseStamped(header(0.0)))]
+    assert main(["info", str(write(tmp_path / "goal", goal))]) == 0
+    assert capsys.readouterr().out.endswith("nothing here tells motion\n")
+    assert main(["info", str(tmp_path / "none")]) == 1
+
+
 def inferred(
     bag: str, grid_map: GridMap | None, **settings: object
 ) -> tuple[Summary, GridMap, str]:

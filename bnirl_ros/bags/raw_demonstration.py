@@ -77,6 +77,21 @@ class _Motion:
     words: str
 
 
+def motion_topics(bag: Bag) -> list[Topic]:
+    """The topics that tell motion, in the order in which they are tried.
+
+    That is by kind, and of a kind those with the most messages first.
+    """
+    found = [
+        topic
+        for topic in bag.topics()
+        if topic.type_name in _KINDS
+        and topic.messages
+        and not topic.name.endswith((*NO_MOTION, "tf_static"))
+    ]
+    return sorted(found, key=lambda topic: (_KINDS.index(topic.type_name), -topic.messages))
+
+
 def is_raw(
     path: str | Path,
     settings: Discretising,
@@ -103,7 +118,7 @@ def is_raw(
         for topic in bag.topics()
         if topic.type_name == TOPIC_TYPES["action"] and topic.name.endswith("action")
     ]
-    return not actions and bool(_sources(bag))
+    return not actions and bool(motion_topics(bag))
 
 
 def read_raw_demonstration(
@@ -221,7 +236,7 @@ class _Reading:
 
     def motion(self, frame_id: str) -> _Motion:
         """The motion that the wanted source tells, or the first one that can be used."""
-        sources = _sources(self.bag)
+        sources = motion_topics(self.bag)
         if self._settings.source:
             wanted = absolute(self._settings.source)
             sources = [topic for topic in sources if topic.name == wanted]
@@ -372,15 +387,3 @@ class _Reading:
                 yield raw.log_time, decode(type_name, raw.data)
             except InputError as error:
                 self.faults[str(error)] += 1
-
-
-def _sources(bag: Bag) -> list[Topic]:
-    """The topics that tell motion by kind, and of a kind those with the most messages first."""
-    found = [
-        topic
-        for topic in bag.topics()
-        if topic.type_name in _KINDS
-        and topic.messages
-        and not topic.name.endswith((*NO_MOTION, "tf_static"))
-    ]
-    return sorted(found, key=lambda topic: (_KINDS.index(topic.type_name), -topic.messages))

@@ -9,14 +9,15 @@ from __future__ import annotations
 import argparse
 import gc
 import os
+import re
 import sys
 from collections.abc import Sequence
 
 from bnirl_ros import __version__
-from bnirl_ros.cli import demo, infer, predict, replay, reproduce, waypoints
+from bnirl_ros.cli import demo, infer, info, predict, replay, reproduce, waypoints
 from bnirl_ros.errors import InputError
 
-COMMANDS = (infer, predict, waypoints, reproduce, replay, demo)
+COMMANDS = (info, infer, predict, waypoints, reproduce, replay, demo)
 """The modules of the subcommands, in the order in which `--help` lists them; each has `add`."""
 
 
@@ -29,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if given[:1] == ["replay"]:  # its options are replay_node's, which argparse cannot know
             return replay.run(given[1:])
-        options = parser().parse_args(given)
+        options = parser().parse_args(_joined(given))
         return int(options.run(options))
     except InputError as error:
         print(f"bnirl: {error}", file=sys.stderr)
@@ -55,3 +56,14 @@ def parser() -> argparse.ArgumentParser:
     for command in COMMANDS:
         command.add(commands)
     return made
+
+
+def _joined(arguments: Sequence[str]) -> list[str]:
+    """The arguments, with a negative x after `--start`, which would be an option, joined to it."""
+    joined: list[str] = []
+    for word in arguments:
+        if joined and joined[-1] == "--start" and re.match(r"-[\d.]", word):
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined

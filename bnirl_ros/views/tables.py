@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from bnirl_ros.bags.reader import Topic
 from bnirl_ros.inference.summary import Parameter, Subgoal, Summary
 from bnirl_ros.views.pursuits import knows_pursuits, unexplained_share
 
@@ -83,6 +84,21 @@ def aligned(table: Sequence[Sequence[str]]) -> str:
         "  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True))
         for row in table
     )
+
+
+def topic_table(topics: Sequence[Topic], motion: Sequence[Topic]) -> str:
+    """One aligned line for each topic of a bag; no newline at the end.
+
+    Args:
+        topics: all of them.
+        motion: those that tell motion, which are numbered in this order.
+    """
+    order = {topic.name: str(place) for place, topic in enumerate(motion, start=1)}
+    rows = [
+        (order.get(topic.name, "-"), str(topic.messages), topic.type_name, topic.name)
+        for topic in topics
+    ]
+    return aligned([("motion", "messages", "type", "topic"), *rows])
 
 
 def convergence(summary: Summary) -> str:
