@@ -206,6 +206,15 @@ def test_poses_that_cannot_be_brought_into_the_maps_frame_are_counted(tmp_path: 
     assert recorded.faults == {"pose with a coordinate that is not finite": 1}
 
 
+def test_all_sources_that_cannot_be_used_are_named_and_what_to_do_once(tmp_path: Path) -> None:
+    bag = write(tmp_path / "bag", [*SOURCES["/odom"], *SOURCES["/amcl_pose"]])
+    with pytest.raises(InputError) as caught:
+        read(bag, map_frame="ship")
+    words = str(caught.value)
+    assert all(f"{topic} tells no pose" in words for topic in ("/odom", "/amcl_pose"))
+    assert words.count("--map-frame") == 1
+
+
 def test_the_map_may_have_another_frame(tmp_path: Path) -> None:
     bag = write(tmp_path / "bag", amcl(frame="robot1/map"))
     recorded, _ = read(bag, map_frame="robot1/map")

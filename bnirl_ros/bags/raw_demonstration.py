@@ -40,6 +40,8 @@ _SECOND = 1_000_000_000
 _KINDS = (*POSE_TYPES, TF, *COMMAND_TYPES)
 """Message types that tell motion, in the order in which they are tried."""
 
+_REMEDY = "; name another topic with --source, or the frames with --map-frame and --base-frame"
+
 
 @dataclass(frozen=True, eq=False)
 class _Told:
@@ -252,7 +254,9 @@ class _Reading:
                 self.warnings += [f"{self.bag.path}: {refusal}" for refusal in refusals]
                 return motion
         if refusals:
-            raise InputError(f"{self.bag.path}: {'; '.join(refusals)}")
+            told = [refusal.removesuffix(_REMEDY) for refusal in refusals]
+            remedy = _REMEDY if told != refusals else ""  # once is enough
+            raise InputError(f"{self.bag.path}: {'; '.join(told)}{remedy}")
         there = ", ".join(f"{topic.name} ({topic.type_name})" for topic in self.bag.topics())
         raise InputError(
             f"{self.bag.path}: {self._settings.source or 'no topic'} tells no motion; there are "
@@ -301,8 +305,7 @@ class _Reading:
         if not known.any():
             reasons = ", ".join(f"{count} x {fault}" for fault, count in faults.items())
             raise InputError(
-                f"{topic.name} tells no pose that can be used ({reasons or 'it has none'}); name "
-                "another topic with --source, or the frames with --map-frame and --base-frame"
+                f"{topic.name} tells no pose that can be used ({reasons or 'it has none'}){_REMEDY}"
             )
         words = f"{topic.name} ({topic.type_name})"
         if moved_from:
