@@ -304,9 +304,8 @@ class _Reading:
         known = np.isfinite(poses).all(axis=1)
         if not known.any():
             reasons = ", ".join(f"{count} x {fault}" for fault, count in faults.items())
-            raise InputError(
-                f"{topic.name} tells no pose that can be used ({reasons or 'it has none'}){_REMEDY}"
-            )
+            fault = f"{topic.name} tells no pose that can be used ({reasons or 'it has none'})"
+            raise InputError(fault + _REMEDY)
         words = f"{topic.name} ({topic.type_name})"
         if moved_from:
             words += f", brought from {' and '.join(moved_from)} to {frame_id} by tf"
