@@ -114,7 +114,10 @@ def replay_and_compare(
     end = start("replay_node", bag, "--fast").end()
     assert end.status == 0, end
     node.until_settled(count)
-    assert float(node.health()["R-hat"]) < 1.05
+    # Which draws these are depends on when messages came, so the bound is the wide one of Gelman
+    # and Rubin; with some hundred effective draws R-hat is 1.02 to 1.06, and far above 1.1 where
+    # chains have not found each other.
+    assert float(node.health()["R-hat"]) < 1.1
     assert set(node.shown().values()) == centres(cells, recorded.grid_map)
 
     response = node.call("infer")
