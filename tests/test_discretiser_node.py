@@ -162,6 +162,7 @@ def test_from_amcl_to_subgoals_live_and_offline_are_the_same(
         peer,
     )
     node = discretiser(source="/amcl_pose")
+    node.until_health("both to hear it, the test and the node of the subgoals", subscribers="2")
     arguments = (bag, "--map", DEPOT, "--fast", "--wait", "2")  # nobody hears the other topics
     assert start("replay_node", *arguments).end().status == 0
     offline, _ = read_raw_demonstration(bag, Discretising(source="/amcl_pose"), load_map(DEPOT))

@@ -206,11 +206,16 @@ class DiscretiserNode(ManagedNode):
                 "poses": str(motion.poses),
                 "visits": str(motion.visits),
                 "opened cells": str(motion.opened),
+                "subscribers": str(min(self._subscribers(name) for name in ("pose", "action"))),
                 "queue": str(motion.waiting + len(self._pending)),
             },
             faults=faults,
             error="; ".join(self._refusals.values()),
         )
+
+    def _subscribers(self, output: str) -> int:
+        """How many hear an output now."""
+        return int(self._outputs[output].get_subscription_count())
 
     def _look_for_topics(self) -> None:
         """Hear what is sought and there by now; looking ends when all is found.
@@ -218,7 +223,7 @@ class DiscretiserNode(ManagedNode):
         Nothing is heard before somebody hears of it: a replay waits for this node, which so waits
         for the next one, and nothing is lost on the way.
         """
-        self._is_heard = self._is_heard or self._outputs["pose"].get_subscription_count() > 0
+        self._is_heard = self._is_heard or self._subscribers("pose") > 0
         if not self._is_heard:
             return
         types = dict(self.get_topic_names_and_types())
