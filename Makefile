@@ -8,6 +8,8 @@ PYTHON ?=
 WITH ?=
 # Further arguments for pytest, such as PYTEST_ARGS='-k bags -x'.
 PYTEST_ARGS ?=
+# How many processes run the tests; `auto` is one for each core. 0 to use a debugger.
+TEST_WORKERS ?= auto
 # Further arguments for the study, such as STUDY_ARGS='--only turtle --jobs 1'.
 STUDY_ARGS ?=
 # Further arguments for the paper's experiments, such as REPRODUCE_ARGS='4.1 --runs 5'.
@@ -45,7 +47,7 @@ lint: venv  ## Check style and types
 	$(BIN)/mypy
 
 unit: venv  ## Run the tests, without the checks of style and types
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n $(TEST_WORKERS) --maxprocesses 4 --dist loadfile $(PYTEST_ARGS)
 
 colcon:  ## Build, test and run the package with colcon, in a folder that is thrown away
 	@scripts/colcon $(PYTEST_ARGS)

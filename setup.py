@@ -44,6 +44,7 @@ EXTRAS = {
         "mcap-ros2-support>=0.5",  # A second decoder, to check the bags that we write.
         "pytest>=7.4",
         "pytest-timeout>=2.2",
+        "pytest-xdist>=3.5",  # Half of the time is waiting, between processes: two at once.
         "setuptools",  # Python 3.12 has none of its own, and a test reads setup.py.
         # A newer one finds more to say, and this tree must pass tomorrow as it does today.
         "mypy==2.4.*",
