@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import math
 import sys
 import time
@@ -27,6 +26,7 @@ from bnirl_ros.inference.watching import BackgroundWatch
 from bnirl_ros.limits import Limits
 from bnirl_ros.maps import FeatureLayer, GridMap, load_features, with_features
 from bnirl_ros.nodes.drawing import Drawing
+from bnirl_ros.nodes.garbage import GarbageSearch
 from bnirl_ros.nodes.managed import LATCHED, ManagedNode, publish, serve
 from bnirl_ros.nodes.parameters import NodeParameter, declare_settings
 from bnirl_ros.nodes.subscriptions import take_together
@@ -163,6 +163,7 @@ class SubgoalNode(ManagedNode):
         super().__init__("subgoal_node", "inference", PARAMETERS)
         self._settings = declare_settings(self, self._use_settings)
         self._answers: list[tuple[Any, Future]] = []
+        self._garbage = GarbageSearch()
         # In a group of its own: in the node's, everything else would wait until it is answered.
         answered_later = ReentrantCallbackGroup()
         self.create_service(Trigger, "~/infer", self._on_infer, callback_group=answered_later)
@@ -347,6 +348,7 @@ class SubgoalNode(ManagedNode):
         self._answer()
         if not self.active:
             return
+        self._garbage.look(len(self._recorder), time.monotonic())
         self._drawing.publish()
         result = self._inference.take_result()
         if result is not None:
@@ -369,10 +371,8 @@ class SubgoalNode(ManagedNode):
         self._answers = [(request, done) for request, done in self._answers if not done.done()]
 
     def _publish(self, result: Result) -> None:
-        if result.summary and not gc.get_freeze_count():
-            # All modules and kernels are there now, and stay: to look through them for what is not
-            # needed any more would hold everybody up for tens of milliseconds.
-            gc.freeze()
+        if result.summary:
+            self._garbage.keep_all()  # all modules and kernels are there now, and stay
         self._result = result
         self._send("subgoals", subgoal_markers, result)
         if result.summary or not self._saved_waypoints:
@@ -408,6 +408,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the node until it is stopped; returns the exit status."""
     # Numpy holds the interpreter for up to its switch interval while a callback waits.
     sys.setswitchinterval(0.0005)
+    GarbageSearch.only_here()
     return serve("subgoal_node", SubgoalNode, arguments)
 
 
