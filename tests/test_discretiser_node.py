@@ -293,6 +293,7 @@ def test_an_intent_counts_where_the_robot_is_held_up(
     way, push = amcl(), commands()
     node.send_map()
     node.announce("/amcl_pose", way[0][2])
+    node.until_health("one", state="following, waiting for the topic of intent, /cmd_vel")
     node.announce("/cmd_vel", push[0][2])
     node.send(way)
     node.until_done(ACTIONS)

@@ -781,7 +781,7 @@ def test_a_signal_ends_the_subgoal_node_while_it_waits(
     subgoals: Callable[..., Subgoals], number: signal.Signals
 ) -> None:
     node = subgoals()
-    node.until_health("rest", state="settled")
+    node.until_health("a map", state="waiting")
     assert_silent_end(node.process, number)
 
 

@@ -196,10 +196,12 @@ class DiscretiserNode(ManagedNode):
         ]
         if motion.grid_map is None:
             waits_for.append("a map")
-        state = f"waiting for {' and '.join(waits_for)}" if waits_for else "following"
+        follows = bool(self._followed) and motion.grid_map is not None
+        states = ["following"] if follows else []
+        states += [f"waiting for {' and '.join(waits_for)}"] if waits_for else []
         return Health(
             subject="motion",
-            state=state,
+            state=", ".join(states),
             message=f"{motion.visits} visits of cells from {motion.poses} poses",
             values={
                 "source": self._followed,

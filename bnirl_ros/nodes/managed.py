@@ -206,7 +206,9 @@ class ManagedNode(LifecycleNode):
         super().on_activate(state)
         self.active = True
         outcome = self._tried("activated", self.activate)
-        if outcome is not TransitionCallbackReturn.SUCCESS:
+        if outcome is TransitionCallbackReturn.SUCCESS:
+            self.get_logger().info("active")
+        else:
             self.on_deactivate(state)
         return outcome
 

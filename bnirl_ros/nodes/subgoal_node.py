@@ -227,10 +227,15 @@ class SubgoalNode(ManagedNode):
         result = self._result
         summary = result.summary if result else None
         observations = len(result.placement.demonstration) if result else 0
-        idle = self._inference.idle and self._watch.idle and self._drawing.idle
+        if self._paused:
+            state = "paused"
+        elif not (self._inference.idle and self._watch.idle and self._drawing.idle):
+            state = "inferring"
+        else:
+            state = "settled" if summary else "waiting"
         return Health(
             subject="inference",
-            state="paused" if self._paused else "settled" if idle else "inferring",
+            state=state,
             message=f"{len(summary.subgoals)} subgoals from {observations} observations"
             if summary
             else "waiting for a map and observations",
