@@ -13,7 +13,7 @@ import zstandard
 
 from bag_support import SHARED_BAGS, needs_shared_bags
 from bnirl_ros.bags.demonstration import read_demonstration
-from bnirl_ros.bags.reader import Bag
+from bnirl_ros.bags.reader import Bag, RawMessage
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.demonstrations.placement import place
 from bnirl_ros.errors import InputError
@@ -252,7 +252,13 @@ def test_the_shipped_commands_are_the_recorded_ones() -> None:
     (topic,) = bag.topics()
     assert (topic.name, topic.type_name) == (turtle.TOPIC, turtle.TYPE)
     if TURTLE.is_dir():
-        assert shipped == list(Bag(TURTLE).messages())
+        recorded = list(Bag(TURTLE).messages())
+        assert list(map(content, shipped)) == list(map(content, recorded))
+
+
+def content(message: RawMessage) -> tuple[str, str, int, bytes]:
+    """What a message says, without how it was sent."""
+    return message.topic, message.type_name, message.log_time, message.data
 
 
 @needs_the_same_zstd

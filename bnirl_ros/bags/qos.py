@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+QOS_KEY, HASH_KEY = "offered_qos_profiles", "topic_type_hash"
+"""Under which a channel's metadata have its publishers' QoS, and its type's hash."""
+
 _HISTORIES = ("system_default", "keep_last", "keep_all", "unknown")
 _RELIABILITIES = ("system_default", "reliable", "best_effort", "unknown", "best_available")
 _DURABILITIES = ("system_default", "transient_local", "volatile", "unknown", "best_available")
@@ -29,6 +32,9 @@ class QosProfile:
     durability: str = "volatile"
     history: str = "keep_last"
     depth: int = 10
+
+    def __str__(self) -> str:
+        return f"{self.reliability} {self.durability} {self.history} {self.depth}"
 
 
 RELIABLE = QosProfile(depth=40_000)

@@ -7,9 +7,9 @@ that a file claims before it is checked.
 
 from __future__ import annotations
 
+import re
 import struct
 import sys
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -19,23 +19,59 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Schema, Statistics
-from mcap.stream_reader import read_magic
+from mcap.stream_reader import MAGIC_SIZE, read_magic
+
+from bnirl_ros.bags.unpacking import Packing, Unpacked, packing_of, unpack
 
 CHUNK_LIMIT = 2**30
-"""Bytes to which a chunk may unpack; a chunk that claims more is refused, not unpacked."""
+"""Bytes to which a chunk may unpack, or `CHUNK_RATIO` times its size if that is more; one that
+claims more is not believed."""
+
+CHUNK_RATIO = 200
+"""How much smaller a chunk beyond `CHUNK_LIMIT` may be packed than unpacked."""
+
+MESSAGE_LIMIT = 2**27
+"""Bytes that a message may have; a record that claims more is damaged."""
+
+DEFINITION_LIMIT = 2**24
+"""Bytes that a schema, a channel or statistics may have; a record that claims more is damaged."""
 
 _FRAME = struct.Struct("<BQ")  # opcode and length of the content, before every record
-_UNPACK_STEP = 32 * 1024  # bytes: so little is lost before damage in a compressed chunk
+_CHUNK_HEAD = struct.Struct("<QQQI")  # first and last time, unpacked size, checksum
+_CHUNK_LEAST = 40  # bytes of a chunk's fields
+_DISBELIEVED = 2**26  # bytes beyond what is believed, in case that only the claim is damaged
+_SEARCH_STEP = 2**20  # bytes that are searched at once for the next record
+_ANY = sys.maxsize
 
 # The kinds of record that are read, beside messages; and how much tells all but their data.
 _READERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.FOOTER: Footer.read,
     Opcode.SCHEMA: Schema.read,
     Opcode.CHANNEL: Channel.read,
-    Opcode.CHUNK: Chunk.read,
     Opcode.STATISTICS: Statistics.read,
 }
-_HEAD_SIZES: dict[int, int] = {Opcode.MESSAGE: 22, Opcode.CHUNK: 64}
+_MESSAGE_HEAD = 22
+
+# The least and the most bytes in the content of each kind of record.
+_SIZES: dict[int, tuple[int, int]] = {
+    Opcode.HEADER: (8, DEFINITION_LIMIT),
+    Opcode.FOOTER: (20, 20),
+    Opcode.SCHEMA: (14, DEFINITION_LIMIT),
+    Opcode.CHANNEL: (16, DEFINITION_LIMIT),
+    Opcode.MESSAGE: (_MESSAGE_HEAD, MESSAGE_LIMIT),
+    Opcode.CHUNK: (_CHUNK_LEAST, _ANY),
+    Opcode.MESSAGE_INDEX: (6, _ANY),
+    Opcode.CHUNK_INDEX: (64, _ANY),
+    Opcode.ATTACHMENT: (36, _ANY),
+    Opcode.ATTACHMENT_INDEX: (48, _ANY),
+    Opcode.STATISTICS: (46, DEFINITION_LIMIT),
+    Opcode.METADATA: (8, _ANY),
+    Opcode.METADATA_INDEX: (20, _ANY),
+    Opcode.SUMMARY_OFFSET: (17, 17),
+    Opcode.DATA_END: (4, 4),
+}
+# What may begin a record: a kind, and a length of less than a terabyte.
+_BEGINNING = re.compile(rb"(?=[\x01-\x0f][\s\S]{5}\x00{3})")
 
 
 class DamageError(Exception):
@@ -53,6 +89,26 @@ class Frame(NamedTuple):
     start: int
     end: int
     damage: str | None = None
+
+
+class ChunkHead(NamedTuple):
+    """What the beginning of a chunk says of it.
+
+    Attributes:
+        time, last_time: the earliest and the latest log time in it [ns].
+        size: of its records when unpacked [bytes], as claimed.
+        crc: of its records; 0 where there is none.
+        packing: how they are packed.
+        start, end: of the packed bytes in their stream; `end` as claimed.
+    """
+
+    time: int
+    last_time: int
+    size: int
+    crc: int
+    packing: Packing
+    start: int
+    end: int
 
 
 @dataclass
@@ -86,40 +142,60 @@ def has_magic(stream: IO[bytes]) -> bool:
         return False
 
 
+def begins_in_spite(stream: IO[bytes], size: int) -> bool:
+    """Whether records follow on the first eight bytes, though these are not the right ones."""
+    first = _frame_at(stream, MAGIC_SIZE, size)
+    return first.opcode == Opcode.HEADER and _is_chained(stream, MAGIC_SIZE, size, 0)
+
+
 def frames_in(stream: IO[bytes], offset: int, size: int) -> Iterator[Frame]:
     """The records from an offset on, with the stream placed at the content of each.
 
-    The last frame is a damaged one, if only because the stream has come to its end.
+    Where no record follows on another, the next one is searched for. The last frame is a damaged
+    one, if only because the stream has come to its end.
     """
-    damage = None
-    while damage is None:
-        stream.seek(offset)
-        frame = stream.read(_FRAME.size)
-        start = offset + _FRAME.size
-        opcode, length = _FRAME.unpack(frame) if len(frame) == _FRAME.size else (0, 0)
-        if len(frame) < _FRAME.size:
-            damage = "it breaks off there, as an interrupted recording does"
-        elif opcode == 0:
-            damage = "there is no record where one should begin"
-        elif length > size - start:
-            damage = f"a record claims {length} bytes where {size - start} are left"
-        yield Frame(opcode, offset, start, min(start + length, size), damage)
-        offset = start + length
+    frame = _frame_at(stream, offset, size)
+    while True:
+        frame, following, search_from = _after(stream, frame, size)
+        if following is not None:
+            yield _placed(stream, frame)
+        else:
+            # A record that claims too much has others inside; but what looks like them must lead
+            # out of it, since this may be a good record, and damaged only what comes after it.
+            out_of = frame.start if frame.damage else frame.end
+            place = _next_record(stream, search_from, size, out_of)
+            if place is None or place > frame.end:
+                yield _placed(stream, frame)
+                if frame.damage is None:  # then it is the record after it that is damaged
+                    after = _frame_at(stream, frame.end, size)
+                    yield _placed(stream, after._replace(end=size if place is None else place))
+            else:
+                damage = frame.damage or "a record claims more bytes than it has"
+                yield _placed(stream, frame._replace(end=place, damage=damage))
+            if place is None:
+                return
+            following = _frame_at(stream, place, size)
+        if following.offset == size:
+            yield following
+            return
+        frame = following
 
 
-def head_at(stream: IO[bytes], frame: Frame) -> McapRecord | None:
+def head_at(stream: IO[bytes], frame: Frame) -> McapRecord | ChunkHead | None:
     """The record at a frame, from a stream placed at its content; None for those of no interest.
 
-    A message comes without its data and a chunk with little of them. Of the records that break
-    off only a chunk is of interest, for it can be unpacked as far as it goes.
+    A message comes without its data. Of the records that break off only a chunk is of interest,
+    for it can be unpacked as far as it goes.
 
     Raises:
         DamageError: the record has fields that cannot be read.
     """
-    if frame.damage is not None and frame.opcode != Opcode.CHUNK:
+    if frame.opcode == Opcode.CHUNK:
+        return _chunk_at(stream, frame)
+    if frame.damage is not None:
         return None
     size = frame.end - frame.start
-    return _record(stream, frame.opcode, min(size, _HEAD_SIZES.get(frame.opcode, size)))
+    return _record(stream, frame.opcode, _MESSAGE_HEAD if frame.opcode == Opcode.MESSAGE else size)
 
 
 def contents_of(data: bytes) -> Contents:
@@ -139,36 +215,170 @@ def contents_of(data: bytes) -> Contents:
         if isinstance(record, Message):
             contents.messages.append(record)
         elif isinstance(record, Channel):
-            contents.channels[record.id] = record
+            contents.channels.setdefault(record.id, record)
         elif isinstance(record, Schema):
-            contents.schemas[record.id] = record
+            contents.schemas.setdefault(record.id, record)
         contents.damage = contents.damage or damage
     return contents
 
 
-def contents_of_chunk(content: bytes) -> Contents:
-    """What the content of a chunk record holds, unpacked as far as it is whole."""
+def unpacked_chunk(stream: IO[bytes], head: ChunkHead, end: int) -> Unpacked:
+    """The records of a chunk as far as they can be unpacked, and why they are not all, if so.
+
+    Args:
+        stream: of the chunk.
+        head: what the chunk claims to be.
+        end: where it ends at the latest.
+    """
+    believed = max(CHUNK_LIMIT, CHUNK_RATIO * (end - head.start))
+    absurd = head.size > believed
+    limit = _DISBELIEVED + (0 if absurd else head.size)
+    unpacked = unpack(stream, head.start, min(head.end, end), head.packing, limit)
+    if head.start <= head.end < end and unpacked.size < head.size:
+        # One of its two lengths must be wrong. It is not the record's, if more can be unpacked.
+        longer = unpack(stream, head.start, end, head.packing, limit)
+        unpacked = longer if longer.size > unpacked.size else unpacked
+    if absurd:
+        damage = f"a chunk claims to unpack to {head.size} bytes, more than {believed}"
+    elif head.end > end:
+        damage = "a chunk breaks off"
+    elif unpacked.damage is not None:
+        damage = f"a chunk {unpacked.damage}"
+    elif unpacked.size != head.size:
+        damage = f"a chunk unpacks to {unpacked.size} bytes instead of {head.size}"
+    elif head.crc not in (0, unpacked.crc):
+        damage = "a chunk's checksum is wrong, so that its messages may be altered"
+    else:
+        return unpacked
+    return unpacked._replace(damage=damage)
+
+
+def _frame_at(stream: IO[bytes], offset: int, size: int) -> Frame:
+    stream.seek(offset)
+    frame = stream.read(_FRAME.size)
+    start = offset + _FRAME.size
+    if len(frame) < _FRAME.size:
+        damage = "it breaks off there, as an interrupted recording does"
+        return Frame(0, offset, size, size, damage)
+    opcode, length = _FRAME.unpack(frame)
+    least, most = _SIZES.get(opcode, (0, _ANY))
+    end = min(start + length, size)
+    if opcode == 0:
+        return Frame(opcode, offset, start, end, "there is no record where one should begin")
+    if length > size - start:
+        damage = f"a record claims {length} bytes where {size - start} are left"
+        return Frame(opcode, offset, start, end, damage)
+    if not least <= length <= most:
+        damage = f"a record claims {length} bytes, which none of its kind has"
+        return Frame(opcode, offset, start, end, damage)
+    return Frame(opcode, offset, start, end)
+
+
+def _after(stream: IO[bytes], frame: Frame, size: int) -> tuple[Frame, Frame | None, int]:
+    """What comes after a record.
+
+    Returns:
+        The record, with the end that it must have; the one after it, or None; and then from where
+        to search for the next one.
+    """
+    if frame.damage is None:
+        following = _frame_at(stream, frame.end, size)
+        # After the footer comes no record. A reader stops there.
+        ended = frame.end == size or frame.opcode == Opcode.FOOTER
+        if following.damage is None or ended or _is_cut_chunk(stream, following):
+            return frame, following, frame.end
+    search_from = frame.offset + 1 if frame.opcode == 0 else frame.start
+    if frame.opcode == Opcode.CHUNK:
+        # A chunk tells its length a second time.
+        try:
+            end = _chunk_at(stream, frame).end
+        except DamageError:
+            return frame, None, search_from
+        if end < size:
+            following = _frame_at(stream, end, size)
+            if following.damage is None and end != frame.end:
+                damage = frame.damage or "a chunk claims a length that it does not have"
+                return frame._replace(end=end, damage=damage), following, end
+        if end == frame.end or (end > size and frame.damage is not None):
+            return frame, None, frame.end
+    return frame, None, search_from
+
+
+def _placed(stream: IO[bytes], frame: Frame) -> Frame:
+    stream.seek(frame.start)
+    return frame
+
+
+def _next_record(stream: IO[bytes], offset: int, size: int, out_of: int) -> int | None:
+    """Where the next records begin, of which one leads to another beyond a place."""
+    while offset + _FRAME.size <= size:
+        stream.seek(offset)
+        block = stream.read(_SEARCH_STEP)
+        for match in _BEGINNING.finditer(block):
+            opcode, length = _FRAME.unpack_from(block, match.start())
+            place = offset + match.start()
+            least, most = _SIZES[opcode]
+            fits = length <= size - place - _FRAME.size
+            if least <= length <= most and fits and _is_chained(stream, place, size, out_of):
+                return place
+        offset += max(len(block) - _FRAME.size + 1, 1)
+    return None
+
+
+def _is_chained(stream: IO[bytes], place: int, size: int, out_of: int) -> bool:
+    """Whether a record begins at a place, and others after it, one at least beyond `out_of`."""
+    frame = _frame_at(stream, place, size)
+    while frame.damage is None and frame.opcode in _SIZES:
+        if frame.opcode == Opcode.FOOTER or frame.offset >= max(out_of, place + 1):
+            return True
+        frame = _frame_at(stream, frame.end, size)
+    return False
+
+
+def _is_cut_chunk(stream: IO[bytes], frame: Frame) -> bool:
+    """Whether this is a chunk that was sound until the end of its file was cut off."""
+    if frame.damage is None or frame.opcode != Opcode.CHUNK:
+        return False
+    stream.seek(frame.offset)
+    _, length = _FRAME.unpack(stream.read(_FRAME.size))
+    try:
+        return _chunk_at(stream, frame).end == frame.start + length
+    except DamageError:
+        return True  # not even its head is there
+
+
+def _chunk_at(stream: IO[bytes], frame: Frame) -> ChunkHead:
+    stream.seek(frame.start)
+    content = stream.read(min(64, frame.end - frame.start))
+    if len(content) < _CHUNK_HEAD.size:
+        raise DamageError("a chunk breaks off")
+    time, last_time, size, crc = _CHUNK_HEAD.unpack_from(content)
     fields = _Fields(content)
     try:
-        unpacked, damage = _unpacked(_parsed(Chunk.read, fields))
-    except DamageError as fault:
-        return Contents(damage=str(fault))
-    contents = contents_of(unpacked)
-    contents.damage = "a chunk breaks off" if fields.short else damage or contents.damage
-    return contents
+        name = _parsed(Chunk.read, fields).compression
+    except DamageError:
+        name = None
+    # The bytes themselves tell how they are packed; the name of it may be damaged.
+    packing, found = packing_of(content[_CHUNK_HEAD.size :], name)
+    if packing is None:
+        if name is None:
+            raise DamageError("a record has fields that cannot be read")
+        raise DamageError(f"a chunk is compressed by {name[:20]!r}, which is no zstd or lz4")
+    data = _CHUNK_HEAD.size + found if found else _CHUNK_LEAST + len((name or "").encode())
+    (length,) = struct.unpack_from("<Q", content, data - 8) if data <= len(content) else (0,)
+    start = frame.start + data
+    return ChunkHead(time, last_time, size, crc, packing, start, start + length)
 
 
 def _record(stream: IO[bytes], opcode: int, size: int) -> McapRecord | None:
     """The record whose content comes next in a stream; None for kinds that are not read."""
     if opcode == Opcode.MESSAGE:
-        if size < _HEAD_SIZES[opcode]:  # the library would read on to the stream's end
-            raise DamageError("a message is too short")
         return _parsed(Message.read, ReadDataStream(stream), size)
     if opcode not in _READERS:
         return None
     fields = _Fields(stream.read(size))
     record = _parsed(_READERS[opcode], fields)
-    if fields.short and opcode != Opcode.CHUNK:
+    if fields.short:
         raise DamageError("a field is longer than its record")
     return record
 
@@ -179,35 +389,3 @@ def _parsed(read: Callable[..., Any], stream: ReadDataStream, *arguments: int) -
         return read(stream, *arguments)
     except (McapError, struct.error, UnicodeDecodeError) as fault:
         raise DamageError("a record has fields that cannot be read") from fault
-
-
-def _unpacked(chunk: Chunk) -> tuple[bytes, str | None]:
-    """A chunk's records as far as they can be unpacked and, where they are not all, why."""
-    import lz4.frame
-    import zstandard
-
-    size, packed = chunk.uncompressed_size, BytesIO(chunk.data)
-    if size > CHUNK_LIMIT:
-        raise DamageError(f"a chunk claims to unpack to {size} bytes, more than {CHUNK_LIMIT}")
-    read: Callable[[int], bytes]
-    if chunk.compression == "":
-        read = packed.read
-    elif chunk.compression == "zstd":
-        read = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True).read
-    elif chunk.compression == "lz4":
-        read = lz4.frame.LZ4FrameFile(packed).read1
-    else:
-        name = chunk.compression[:20]
-        raise DamageError(f"a chunk is compressed by {name!r}, which is no zstd or lz4")
-    unpacked = bytearray()
-    try:
-        # In steps, so that what comes before damage is kept; one byte past the size at most.
-        while step := read(min(_UNPACK_STEP, size + 1 - len(unpacked))):
-            unpacked += step
-    except (zstandard.ZstdError, RuntimeError, EOFError):
-        return bytes(unpacked), "a chunk cannot be unpacked to its end"
-    if len(unpacked) != size:
-        return bytes(unpacked), f"a chunk unpacks to {len(unpacked)} bytes instead of {size}"
-    if chunk.uncompressed_crc not in (0, zlib.crc32(unpacked)):
-        return bytes(unpacked), "a chunk's checksum is wrong, so that its messages may be altered"
-    return bytes(unpacked), None
