@@ -400,24 +400,26 @@ def test_the_command_tells_what_is_in_a_bag(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     everything = [*SOURCES["/odom"], *SOURCES["/amcl_pose"], *commands()]
-    assert main(["info", str(write(tmp_path / "bag", everything))]) == 0
-    *table, words = capsys.readouterr().out.splitlines()
-    assert [line.split() for line in table] == [
+    assert main(["bag", "info", str(write(tmp_path / "bag", everything))]) == 0
+    _, _, *table, words, lacks = capsys.readouterr().out.splitlines()
+    assert [line.split()[:4] for line in table] == [
         ["motion", "messages", "type", "topic"],
         ["2", "14", "geometry_msgs/msg/PoseWithCovarianceStamped", "/amcl_pose"],
         ["4", "80", "geometry_msgs/msg/Twist", "/cmd_vel"],
         ["1", "81", "nav_msgs/msg/Odometry", "/odom"],
         ["3", "17", "tf2_msgs/msg/TFMessage", "/tf"],
     ]
-    assert words.startswith("bnirl infer takes the motion on topic 1, ")
-    assert main(["info", str(BAGS / "paper_loop")]) == 0
+    assert words.startswith("bnirl infer takes motion from /odom (nav_msgs/msg/Odometry), 81 ")
+    assert lacks.startswith("missing: no map: give one with `--map`")
+    assert main(["bag", "info", str(BAGS / "paper_loop")]) == 0
     table = capsys.readouterr().out.splitlines()
-    assert table[1].split()[0] == "-"
-    assert table[-1] == "bnirl infer takes poses and actions"
+    assert [line.split()[0] for line in table[3:6]] == ["-", "-", "-"]
+    assert table[-1].startswith("bnirl infer takes poses and actions from /pose and /action; the ")
     goal = [("/goal_pose", 0.0, PoseStamped(header(0.0)))]
-    assert main(["info", str(write(tmp_path / "goal", goal))]) == 0
-    assert capsys.readouterr().out.endswith("nothing here tells motion\n")
-    assert main(["info", str(tmp_path / "none")]) == 1
+    assert main(["bag", "info", str(write(tmp_path / "goal", goal))]) == 0
+    told = capsys.readouterr().out
+    assert "bnirl infer takes nothing\nmissing: no topic tells where the demonstrator was" in told
+    assert main(["bag", "info", str(tmp_path / "none")]) == 1
 
 
 def inferred(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
@@ -79,19 +79,31 @@ class _Motion:
     words: str
 
 
-def motion_topics(bag: Bag) -> list[Topic]:
-    """The topics that tell motion, in the order in which they are tried.
+def motion_topics(topics: Iterable[Topic]) -> list[Topic]:
+    """Those of a bag's topics that tell motion, in the order in which they are tried.
 
     That is by kind, and of a kind those with the most messages first.
     """
     found = [
         topic
-        for topic in bag.topics()
+        for topic in topics
         if topic.type_name in _KINDS
         and topic.messages
         and not topic.name.endswith((*NO_MOTION, "tf_static"))
     ]
     return sorted(found, key=lambda topic: (_KINDS.index(topic.type_name), -topic.messages))
+
+
+def action_topics(topics: Iterable[Topic]) -> list[Topic]:
+    """Those of a bag's topics that carry actions, also under another name, which is to be told.
+
+    Nothing else is called so and of that type.
+    """
+    return [
+        topic
+        for topic in topics
+        if topic.type_name == TOPIC_TYPES["action"] and topic.name.endswith("action")
+    ]
 
 
 def is_raw(
@@ -113,14 +125,8 @@ def is_raw(
         return True
     if {"pose", "action"} & set(remappings):
         return False
-    bag = Bag(path)
-    # Actions under another name are to be named: nothing else is called so and of that type.
-    actions = [
-        topic
-        for topic in bag.topics()
-        if topic.type_name == TOPIC_TYPES["action"] and topic.name.endswith("action")
-    ]
-    return not actions and bool(motion_topics(bag))
+    topics = Bag(path).topics()
+    return not action_topics(topics) and bool(motion_topics(topics))
 
 
 def read_raw_demonstration(
@@ -238,7 +244,7 @@ class _Reading:
 
     def motion(self, frame_id: str) -> _Motion:
         """The motion that the wanted source tells, or the first one that can be used."""
-        sources = motion_topics(self.bag)
+        sources = motion_topics(self.bag.topics())
         if self._settings.source:
             wanted = absolute(self._settings.source)
             sources = [topic for topic in sources if topic.name == wanted]

@@ -11,7 +11,8 @@ from typing import IO, TYPE_CHECKING
 from bnirl_ros import __version__
 from bnirl_ros.bags.cdr import Message, encode
 from bnirl_ros.bags.definitions import full_type_name, message_definition, type_hash
-from bnirl_ros.bags.qos import QosProfile, qos_to_yaml
+from bnirl_ros.bags.qos import HASH_KEY, QOS_KEY, QosProfile, qos_to_yaml
+from bnirl_ros.bags.reader import RawMessage, Topic
 from bnirl_ros.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,7 +24,8 @@ but the last are safe when the writing process is killed."""
 
 _NEVER = 2**63 - 1  # rosbag2's starting time of a bag without messages [ns]
 _TOPIC_NAME = re.compile(r"~?/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*")
-_PLAIN_YAML = re.compile(r"[A-Za-z_][\w.-]*")
+_PLAIN_YAML = re.compile(r"~?/?[A-Za-z_][\w./-]*")
+_NUMBERED_POLICY = re.compile(r"\b(history|reliability|durability|liveliness): *\d")
 
 
 @dataclass
@@ -32,7 +34,9 @@ class _Channel:
 
     name: str
     type_name: str
-    qos: QosProfile
+    encoding: str
+    qos_yaml: str
+    type_hash: str
     id: int
     messages: int = 0
 
@@ -57,8 +61,8 @@ class BagWriter:
         self._file_name = f"{self._folder.resolve().name}_0.mcap"
         self._partial = self._folder / f"{self._file_name}.partial"
         self._overwrite = overwrite
-        self._channels: dict[str, _Channel] = {}
-        self._schema_ids: dict[str, int] = {}
+        self._channels: dict[str | tuple[str, ...], _Channel] = {}
+        self._schema_ids: dict[tuple[str, str, bytes], int] = {}
         self._start: int | None = None
         self._end = 0
         self._stream: IO[bytes] | None = None
@@ -113,23 +117,21 @@ class BagWriter:
             raise ValueError(f"{name!r} is no name for a topic.")
         if name in self._channels:
             raise ValueError(f"The topic {name} is in the bag already.")
-        writer = self._open_writer()
         type_name = full_type_name(type_name)
-        definition = message_definition(type_name)
-        if type_name not in self._schema_ids:
-            self._schema_ids[type_name] = writer.register_schema(
-                name=type_name, encoding="ros2msg", data=definition.encode()
-            )
-        channel = writer.register_channel(
-            topic=name,
-            message_encoding="cdr",
-            schema_id=self._schema_ids[type_name],
-            metadata={
-                "offered_qos_profiles": qos_to_yaml([qos]),
-                "topic_type_hash": type_hash(type_name),
-            },
+        schema = (type_name, "ros2msg", message_definition(type_name).encode())
+        metadata = {QOS_KEY: qos_to_yaml([qos]), HASH_KEY: type_hash(type_name)}
+        self._channels[name] = self._channel(name, type_name, "cdr", schema, metadata)
+
+    def add_recorded_topic(self, topic: Topic) -> None:
+        """Announce a topic of another bag, of any type, with all that is recorded of it."""
+        recorded = topic.schema
+        schema = (recorded.name, recorded.encoding, recorded.data) if recorded else None
+        metadata = dict(topic.metadata)
+        if _NUMBERED_POLICY.search(metadata.get(QOS_KEY, "")):  # from before version 9
+            metadata[QOS_KEY] = qos_to_yaml(topic.qos)
+        self._channels[topic.key] = self._channel(
+            topic.name, topic.type_name, topic.encoding, schema, metadata
         )
-        self._channels[name] = _Channel(name, type_name, qos, channel)
 
     def write(self, topic: str, message: Message, log_time_ns: int) -> None:
         """Add a message.
@@ -148,18 +150,64 @@ class BagWriter:
             raise ValueError(f"The topic {topic} carries {channel.type_name}, no {message.TYPE}.")
         self.write_encoded(topic, encode(message), log_time_ns)
 
+    def write_recorded(self, message: RawMessage) -> None:
+        """Add a message of a topic that `add_recorded_topic` announced: its bytes, its times.
+
+        Raises:
+            ValueError: the topic was not announced, or its log time lies outside 0 to 2^63 - 1.
+        """
+        self._add(
+            message.key,
+            message.data,
+            message.log_time,
+            publish_time=message.publish_time,
+            sequence=message.sequence,
+        )
+
     def write_encoded(self, topic: str, data: bytes, log_time_ns: int) -> None:
         """Add a message that is CDR already, as `write` does; its bytes are not looked at."""
-        channel = self._channels.get(topic)
+        self._add(topic, data, log_time_ns, publish_time=log_time_ns)
+
+    def _channel(
+        self,
+        name: str,
+        type_name: str,
+        encoding: str,
+        schema: tuple[str, str, bytes] | None,
+        metadata: dict[str, str],
+    ) -> _Channel:
+        """A channel of the file; `schema` is a type's name, and a definition's kind and text."""
+        writer = self._open_writer()
+        if schema is not None and schema not in self._schema_ids:
+            self._schema_ids[schema] = writer.register_schema(*schema)
+        number = writer.register_channel(
+            topic=name,
+            message_encoding=encoding,
+            schema_id=self._schema_ids[schema] if schema is not None else 0,
+            metadata=metadata,
+        )
+        qos, digest = metadata.get(QOS_KEY, ""), metadata.get(HASH_KEY, "")
+        return _Channel(name, type_name, encoding, qos, digest, number)
+
+    def _add(
+        self,
+        key: str | tuple[str, ...],
+        data: bytes,
+        log_time_ns: int,
+        publish_time: int,
+        sequence: int = 0,
+    ) -> None:
+        channel = self._channels.get(key)
         if channel is None:
-            raise ValueError(f"The topic {topic} was not added to the bag.")
+            raise ValueError(f"The topic {key} was not added to the bag.")
         if not 0 <= log_time_ns <= _NEVER:
             raise ValueError(f"{log_time_ns} ns is no time that a bag can hold.")
         self._open_writer().add_message(
             channel_id=channel.id,
             log_time=log_time_ns,
-            publish_time=log_time_ns,
+            publish_time=publish_time,
             data=data,
+            sequence=sequence,
         )
         channel.messages += 1
         self._start = log_time_ns if self._start is None else min(self._start, log_time_ns)
@@ -221,15 +269,16 @@ ros_distro: jazzy"""
 
 
 def _topic_metadata(channel: _Channel) -> str:
-    qos = "\n".join(f"        {line}" for line in qos_to_yaml([channel.qos]).splitlines())
+    profiles = channel.qos_yaml if channel.qos_yaml.lstrip().startswith("-") else "[]"
+    qos = "\n".join(f"        {line}" for line in profiles.splitlines())
     return f"""\
   - topic_metadata:
-      name: {channel.name}
-      type: {channel.type_name}
-      serialization_format: cdr
+      name: {_quoted(channel.name)}
+      type: {_quoted(channel.type_name)}
+      serialization_format: {_quoted(channel.encoding)}
       offered_qos_profiles:
 {qos}
-      type_description_hash: {type_hash(channel.type_name)}
+      type_description_hash: {_quoted(channel.type_hash)}
     message_count: {channel.messages}"""
 
 

@@ -14,10 +14,10 @@ import sys
 from collections.abc import Sequence
 
 from bnirl_ros import __version__
-from bnirl_ros.cli import demo, infer, info, predict, replay, reproduce, waypoints
+from bnirl_ros.cli import bag, demo, infer, predict, replay, reproduce, waypoints
 from bnirl_ros.errors import InputError
 
-COMMANDS = (info, infer, predict, waypoints, reproduce, replay, demo)
+COMMANDS = (bag, infer, predict, waypoints, reproduce, replay, demo)
 """The modules of the subcommands, in the order in which `--help` lists them; each has `add`."""
 
 

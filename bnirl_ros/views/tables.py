@@ -95,10 +95,16 @@ def topic_table(topics: Sequence[Topic], motion: Sequence[Topic]) -> str:
     """
     order = {topic.name: str(place) for place, topic in enumerate(motion, start=1)}
     rows = [
-        (order.get(topic.name, "-"), str(topic.messages), topic.type_name, topic.name)
+        (
+            order.get(topic.name, "-"),
+            str(topic.messages),
+            topic.type_name or "unknown",
+            topic.name,
+            ", ".join(dict.fromkeys(map(str, topic.qos))) or "-",
+        )
         for topic in topics
     ]
-    return aligned([("motion", "messages", "type", "topic"), *rows])
+    return aligned([("motion", "messages", "type", "topic", "quality of service"), *rows])
 
 
 def convergence(summary: Summary) -> str:
