@@ -16,6 +16,10 @@ STUDY_ARGS ?=
 REPRODUCE_ARGS ?=
 # The folder with the recordings of human play, for `make bags` and `make study`.
 OVERCOOKED ?= ../shared/data/overcooked
+# Further arguments for the campaign of damage, such as CAMPAIGN_ARGS='--cuts 10 --changes 50'.
+CAMPAIGN_ARGS ?=
+# Recordings of others, for `make campaigns`.
+BAGS ?= ../shared/data/bags
 # The recording of a turtlesim robot, for `make bags`.
 TURTLE ?= ../shared/data/bags/turtle_waypoints
 
@@ -31,7 +35,7 @@ endif
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 unexport AMENT_PREFIX_PATH PYTHONPATH PYTHONHOME RMW_IMPLEMENTATION
 
-.PHONY: help demo test lint unit colcon bags reference benchmark study reproduce venv clean
+.PHONY: help demo test lint unit colcon bags reference benchmark campaigns study reproduce venv clean
 
 help:  ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -62,6 +66,9 @@ reference: venv  ## Write docs/reference.md, the topics and parameters of the no
 benchmark: venv  ## Time the main job and its parts, and load the subgoal node
 	$(BIN)/python benchmarks/main_job.py
 	$(BIN)/python benchmarks/load.py
+
+campaigns: venv  ## Damage bags in thousands of ways, and see what is read of them
+	$(BIN)/python -m bnirl_ros.experiments.damage $(CAMPAIGN_ARGS) bags $(wildcard $(BAGS))
 
 study: venv  ## Measure what the models find, into bnirl_out/study.md
 	$(BIN)/python -m bnirl_ros.experiments.study --overcooked "$(OVERCOOKED)" $(STUDY_ARGS)
