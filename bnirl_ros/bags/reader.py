@@ -158,13 +158,9 @@ class Bag:
 
     def topics(self) -> list[Topic]:
         """The topics by name, those without messages among them."""
-        found: dict[tuple[str, str, str], Topic] = {}
-        for file in self._files:
-            for channel in file.channels.values():
-                topic = file.topic(channel)
-                key = topic.key
-                found[key] = _joined(found[key], topic) if key in found else topic
-        return [found[key] for key in sorted(found)]
+        return joined(
+            file.topic(channel) for file in self._files for channel in file.channels.values()
+        )
 
     @property
     def span(self) -> tuple[int, int] | None:
@@ -303,6 +299,15 @@ def _counts_in(values: Mapping[str, Any], files: int) -> list[int | None]:
         counts = [values.get("message_count")] if files == 1 else []
     known = len(counts) == files and all(isinstance(count, int) for count in counts)
     return counts if known else [None] * files
+
+
+def joined(topics: Iterable[Topic]) -> list[Topic]:
+    """The topics by name, each once that several files, or channels of a file, hold."""
+    found: dict[tuple[str, str, str], Topic] = {}
+    for topic in topics:
+        known = found.get(topic.key)
+        found[topic.key] = topic if known is None else _joined(known, topic)
+    return [found[key] for key in sorted(found)]
 
 
 def _joined(first: Topic, second: Topic) -> Topic:
