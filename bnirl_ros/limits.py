@@ -111,3 +111,11 @@ def one_or_more(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"must be at least 1, not {text}")
     return value
+
+
+def zero_or_more(text: str) -> float:
+    """A finite number of at least 0 from a command line, for argparse."""
+    value = float(text)
+    if not 0.0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"must be at least 0, not {text}")
+    return value

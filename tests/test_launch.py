@@ -26,7 +26,7 @@ rclpy = pytest.importorskip("rclpy", reason="the nodes' tables need rclpy")
 from bnirl_ros.nodes import discretiser_node, subgoal_node  # noqa: E402
 from bnirl_ros.nodes.managed import AUTOSTART, DIAGNOSTICS  # noqa: E402
 from bnirl_ros.nodes.parameters import declare, parameter_of  # noqa: E402
-from bnirl_ros.nodes.replay_node import parse  # noqa: E402
+from bnirl_ros.nodes.replay_options import parse  # noqa: E402
 
 LAUNCH_FILE = ROOT / "launch" / "bringup.launch.py"
 CONFIGS = sorted((ROOT / "config").iterdir())
@@ -145,7 +145,7 @@ def test_the_subgoal_node_hears_what_the_discretiser_node_makes(nodes: dict[str,
 def test_a_replay_gets_arguments_that_it_takes(given: dict[str, str]) -> None:
     (node,) = (each for each in started(LAUNCH_FILE, given) if each.executable == "replay_node")
     wanted = {
-        "bag": Path(BAG),
+        "bags": (Path(BAG),),
         "rate": float(given.get("rate", 1.0)),
         "grid_map": Path(MAP_FILE) if "map" in given else None,
     }

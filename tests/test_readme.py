@@ -101,7 +101,7 @@ def test_there_are_commands_to_parse() -> None:
 
 def test_replay_commands_parse() -> None:
     pytest.importorskip("rclpy")
-    from bnirl_ros.nodes.replay_node import parse
+    from bnirl_ros.nodes.replay_options import parse
 
     replays = arguments_of("ros2", "run", "bnirl_ros", "replay_node")
     assert replays

@@ -46,8 +46,7 @@ def player_of(
         yield from (each for each in messages if each.log_time >= time)
 
     clock = Time()
-    begin, end = messages[0].log_time, messages[-1].log_time
-    source = Source(begin, end, since, lambda time: list(latched))
+    source = Source(messages[0].log_time, since, lambda time: list(latched))
     player = Player(source, clock=clock, **options)
     player.start()
     return player, clock

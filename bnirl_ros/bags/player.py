@@ -25,14 +25,13 @@ class Source:
     """Where a player has its messages from.
 
     Attributes:
-        begin, end: log times between which it plays, both included [ns].
+        begin: log time at which it begins [ns].
         messages: those from a log time on.
         latched: what was latched at a log time and is to be sent there first; it may have
             messages that come later, which then are not sent again.
     """
 
     begin: int
-    end: int
     messages: Callable[[int], Messages]
     latched: Callable[[int], list[RawMessage]]
 

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
+
+from bnirl_ros.errors import InputError
 
 QOS_KEY, HASH_KEY = "offered_qos_profiles", "topic_type_hash"
 """Under which a channel's metadata have its publishers' QoS, and its type's hash."""
@@ -13,6 +16,19 @@ QOS_KEY, HASH_KEY = "offered_qos_profiles", "topic_type_hash"
 _HISTORIES = ("system_default", "keep_last", "keep_all", "unknown")
 _RELIABILITIES = ("system_default", "reliable", "best_effort", "unknown", "best_available")
 _DURABILITIES = ("system_default", "transient_local", "volatile", "unknown", "best_available")
+_OVERRIDES = {
+    "reliability": ("reliable", "best_effort"),
+    "durability": ("volatile", "transient_local"),
+    "history": ("keep_last", "keep_all"),
+}
+# What else rosbag2 takes there; nothing of ours has a deadline or a lifespan.
+_NOT_OVERRIDDEN = (
+    "deadline",
+    "lifespan",
+    "liveliness",
+    "liveliness_lease_duration",
+    "avoid_ros_namespace_conventions",
+)
 
 
 @dataclass(frozen=True)
@@ -78,6 +94,46 @@ def qos_from_yaml(text: str) -> tuple[QosProfile, ...]:
     if not isinstance(profiles, list):
         return ()
     return tuple(_profile(each) for each in profiles if isinstance(each, dict))
+
+
+def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
+    """What a file of QoS overrides, as of `ros2 bag play`, says of each topic.
+
+    Deadline, lifespan and liveliness are passed over.
+
+    Raises:
+        InputError: the file cannot be read, or says what cannot be.
+    """
+    try:
+        values = parse_yaml(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as fault:
+        raise InputError(
+            f"{path}: the QoS overrides cannot be read ({fault}); check the path"
+        ) from fault
+    if not isinstance(values, dict):
+        raise InputError(f"{path}: has no topics with QoS; write such as '/pose: {{depth: 10}}'")
+    return {
+        str(topic): _override(f"{path}: {topic}", policies) for topic, policies in values.items()
+    }
+
+
+def _override(place: str, policies: Any) -> dict[str, Any]:
+    if not isinstance(policies, dict):
+        raise InputError(f"{place}: has no QoS policies; write such as 'reliability: best_effort'")
+    for name, value in policies.items():
+        if name in _NOT_OVERRIDDEN:
+            continue
+        if name == "depth":
+            if type(value) is not int or value < 1:
+                raise InputError(f"{place}: depth must be a whole number above 0, not {value!r}")
+        elif name not in _OVERRIDES:
+            known = ", ".join([*_OVERRIDES, "depth", *_NOT_OVERRIDDEN])
+            raise InputError(f"{place}: has no policy {name!r}; there are {known}")
+        elif value not in _OVERRIDES[name]:
+            raise InputError(
+                f"{place}: {name} must be {' or '.join(_OVERRIDES[name])}, not {value!r}"
+            )
+    return {name: policies[name] for name in policies if name not in _NOT_OVERRIDDEN}
 
 
 def parse_yaml(text: str) -> Any:

@@ -43,6 +43,23 @@ def run(name: str, body: Callable[[], None], arguments: Sequence[str] | None = N
         rclpy.try_shutdown()
 
 
+def separated(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """A command line without ROS's arguments, and these alone, each with its `--ros-args`.
+
+    rclpy's own function also takes away what looks like a remapping anywhere else.
+    """
+    own: list[str] = []
+    of_ros: list[str] = []
+    here = own
+    for argument in arguments:
+        if argument == "--ros-args":
+            here = of_ros
+        here.append(argument)
+        if argument == "--" and here is of_ros:
+            here = own
+    return own, of_ros
+
+
 def spin(node: Any) -> None:
     """Serve a node's callbacks, one after the other, until it is told to end.
 
