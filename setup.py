@@ -14,7 +14,7 @@ SHARED_FOLDERS = ("launch", "config", "rviz", "foxglove", "bags", "msg_schemas")
 REQUIREMENTS = [
     "lz4>=4.0",
     "matplotlib>=3.6",
-    "mcap>=1.2.1",
+    "mcap>=1.5",
     "numba>=0.58",
     "numpy>=1.26",
     "pillow>=10.2",
@@ -95,6 +95,7 @@ setup(
         "console_scripts": [
             "bnirl = bnirl_ros.cli:main",
             "discretiser_node = bnirl_ros.nodes.start:discretiser_node",
+            "record_node = bnirl_ros.nodes.start:record_node",
             "replay_node = bnirl_ros.nodes.start:replay_node",
             "subgoal_node = bnirl_ros.nodes.start:subgoal_node",
         ],

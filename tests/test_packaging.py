@@ -124,7 +124,9 @@ def test_there_is_one_version(
     assert package_xml.findtext("version") == bnirl_ros.__version__
 
 
-@pytest.mark.parametrize("name", ["bnirl", "discretiser_node", "replay_node", "subgoal_node"])
+@pytest.mark.parametrize(
+    "name", ["bnirl", "discretiser_node", "record_node", "replay_node", "subgoal_node"]
+)
 def test_executables_start_at_a_function(name: str, setup_arguments: dict[str, Any]) -> None:
     scripts = setup_arguments["entry_points"]["console_scripts"]
     place = dict(re.split(r"\s*=\s*", script) for script in scripts)[name]

@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import IO, TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Self
 
 from bnirl_ros import __version__
 from bnirl_ros.bags.cdr import Message, encode
@@ -68,7 +68,7 @@ class BagWriter:
         self._stream: IO[bytes] | None = None
         self._writer: Writer | None = None
 
-    def __enter__(self) -> BagWriter:
+    def __enter__(self) -> Self:
         """Make the folder and begin the file, under a name that no reader takes for a bag."""
         from mcap.writer import Writer  # only those who write pay for it
 
@@ -79,7 +79,7 @@ class BagWriter:
                     "overwritten"
                 )
             self._folder.mkdir(parents=True, exist_ok=True)
-            self._stream = self._partial.open("wb")
+            self._stream = self._open_file()
         except OSError as fault:
             raise InputError(
                 f"{self._folder}: cannot be written ({fault.strerror}); choose a folder that can"
@@ -106,8 +106,16 @@ class BagWriter:
             if self._folder.is_dir() and not any(self._folder.iterdir()):
                 self._folder.rmdir()
 
-    def add_topic(self, name: str, type_name: str, qos: QosProfile) -> None:
+    def _open_file(self) -> IO[bytes]:
+        return self._partial.open("wb")
+
+    def add_topic(self, name: str, type_name: str, *qos: QosProfile) -> None:
         """Announce a topic; also one without messages then is in the bag.
+
+        Args:
+            name: of the topic.
+            type_name: of its messages.
+            qos: what each of its publishers offers.
 
         Raises:
             InputError: the message type is unknown.
@@ -119,7 +127,7 @@ class BagWriter:
             raise ValueError(f"The topic {name} is in the bag already.")
         type_name = full_type_name(type_name)
         schema = (type_name, "ros2msg", message_definition(type_name).encode())
-        metadata = {QOS_KEY: qos_to_yaml([qos]), HASH_KEY: type_hash(type_name)}
+        metadata = {QOS_KEY: qos_to_yaml(qos), HASH_KEY: type_hash(type_name)}
         self._channels[name] = self._channel(name, type_name, "cdr", schema, metadata)
 
     def add_recorded_topic(self, topic: Topic) -> None:

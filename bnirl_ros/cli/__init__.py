@@ -14,10 +14,10 @@ import sys
 from collections.abc import Sequence
 
 from bnirl_ros import __version__
-from bnirl_ros.cli import bag, demo, infer, predict, replay, reproduce, waypoints
+from bnirl_ros.cli import bag, demo, infer, predict, record, replay, reproduce, waypoints
 from bnirl_ros.errors import InputError
 
-COMMANDS = (bag, infer, predict, waypoints, reproduce, replay, demo)
+COMMANDS = (bag, infer, predict, waypoints, reproduce, replay, record, demo)
 """The modules of the subcommands, in the order in which `--help` lists them; each has `add`."""
 
 
@@ -28,8 +28,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     gc.disable()
     given = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        if given[:1] == ["replay"]:  # its options are replay_node's, which argparse cannot know
-            return replay.run(given[1:])
+        for command in (replay, record):  # their options are a node's, which argparse cannot know
+            if given[:1] == [command.NAME]:
+                return command.run(given[1:])
         options = parser().parse_args(_joined(given))
         return int(options.run(options))
     except InputError as error:

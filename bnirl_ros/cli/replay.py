@@ -6,10 +6,12 @@ import gc
 from collections.abc import Sequence
 from typing import Any
 
+NAME = "replay"
+
 
 def add(commands: Any) -> None:
     """The subcommand; its options are replay_node's, which it reads itself."""
-    commands.add_parser("replay", help="play a recorded demonstration onto its topics")
+    commands.add_parser(NAME, help="play recorded demonstrations onto their topics")
 
 
 def run(arguments: Sequence[str]) -> int:

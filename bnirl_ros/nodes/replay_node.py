@@ -111,6 +111,7 @@ class ReplayNode(Node):
         self._bags = bags
         self._options = options
         self._topic_publishers: dict[str, Any] = {}
+        self._types: dict[str, str] = {}  # of the topics; a name may have several in a recording
         self._depths: dict[str, int] = {}  # of latched topics
         self._rounds: dict[str, int] = {}  # messages after which all must be acknowledged
         self._given_up: set[str] = set()  # topics that somebody doesn't acknowledge
@@ -200,6 +201,7 @@ class ReplayNode(Node):
         subscribers have acknowledged those before.
         """
         player = self._player
+        begun = time.monotonic()
         player.start()
         while not player.finished and not self._stopped:
             wait = min(player.due_in(), _LOOK_PERIOD)
@@ -217,11 +219,13 @@ class ReplayNode(Node):
                 self._send(message)
                 if player.rate is None:
                     break
-        if not self._stopped:
-            for topic in self._topic_publishers:
-                self._wait_until_acknowledged(topic)
-        elif not self.end:
+        if self._stopped:
             self.end = f"stopped at {self._seconds():.1f} s of {self._length:.1f} s"
+            return
+        for topic in self._topic_publishers:
+            self._wait_until_acknowledged(topic)
+        passed = time.monotonic() - begun
+        self.get_logger().info(f"played {self.sent.total()} messages in {passed:.3f} s")
 
     def close(self) -> None:
         """Let go of everything."""
@@ -301,6 +305,11 @@ class ReplayNode(Node):
     # Publishing
 
     def _announce(self, topic: Topic) -> None:
+        if topic.name in self._topic_publishers:
+            self._skip(
+                replace(topic, name=f"{topic.name} ({topic.type_name})"), "its name is taken"
+            )
+            return
         if topic.encoding != "cdr":
             self._skip(topic, f"encoded as {topic.encoding or 'nothing'}, not cdr")
             return
@@ -325,6 +334,7 @@ class ReplayNode(Node):
         except InvalidTopicNameException as error:
             raise InputError(f"{name}: is no name for a topic; choose another one") from error
         self._topic_publishers[topic.name] = publisher
+        self._types[topic.name] = topic.type_name
         self._rounds[topic.name] = min(max(1, qos.depth), _ROUND)
 
     def _skip(self, topic: Topic, why: str) -> None:
@@ -361,6 +371,8 @@ class ReplayNode(Node):
 
     def _send(self, message: RawMessage) -> None:
         topic = message.topic
+        if message.type_name != self._types[topic] or message.encoding != "cdr":
+            return
         self._topic_publishers[topic].publish(message.data)
         self.sent[topic] += 1
         if self._player.rate is None and self.sent[topic] % self._rounds[topic] == 0:

@@ -105,15 +105,35 @@ def parse(arguments: Sequence[str], name: str = "replay_node") -> Options:
         paused=given.start_paused,
         loop=given.loop,
         longest_silence=silence,
-        selection=Selection(
-            None if given.topics is None else tuple(map(absolute, given.topics)),
-            given.regex,
-            tuple(map(absolute, given.exclude_topics)),
-            given.exclude_regex,
-        ),
+        selection=selection_of(given, given.topics),
         remaps=tuple(given.remap),
         qos_overrides=given.qos_profile_overrides_path,
         clock=given.clock,
+    )
+
+
+def selection_of(given: argparse.Namespace, topics: Sequence[str] | None = None) -> Selection:
+    """What the options of `add_selection` say, and the names of wanted topics."""
+    return Selection(
+        None if topics is None else tuple(map(absolute, topics)),
+        given.regex,
+        tuple(map(absolute, given.exclude_topics)),
+        given.exclude_regex,
+    )
+
+
+def add_selection(parser: argparse._ActionsContainer) -> None:
+    """Options by which topics are chosen."""
+    parser.add_argument("-e", "--regex", type=_pattern, help="only those whose whole name matches")
+    parser.add_argument(
+        "--exclude-topics", nargs="+", default=(), metavar="TOPIC", help="leave these out"
+    )
+    parser.add_argument(
+        "-x",
+        "--exclude-regex",
+        type=_pattern,
+        metavar="REGEX",
+        help="leave those out whose whole name matches",
     )
 
 
@@ -203,19 +223,7 @@ def _parser(name: str) -> argparse.ArgumentParser:
 
 def _add_topics(parser: argparse._ArgumentGroup) -> None:
     parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="play only these")
-    parser.add_argument(
-        "-e", "--regex", type=_pattern, help="play only those whose whole name matches"
-    )
-    parser.add_argument(
-        "--exclude-topics", nargs="+", default=(), metavar="TOPIC", help="leave these out"
-    )
-    parser.add_argument(
-        "-x",
-        "--exclude-regex",
-        type=_pattern,
-        metavar="REGEX",
-        help="leave those out whose whole name matches",
-    )
+    add_selection(parser)
     parser.add_argument(
         "-m",
         "--remap",

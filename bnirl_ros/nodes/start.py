@@ -26,6 +26,11 @@ def replay_node() -> int:
     return _main_of("replay_node")
 
 
+def record_node() -> int:
+    """Run the record node; returns the exit status."""
+    return _main_of("record_node")
+
+
 def require_ros() -> None:
     """Say what to do where there is no rclpy.
 
