@@ -70,7 +70,10 @@ def process(name: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
     """One of our nodes, stopped at the end."""
     code = f"import sys; from bnirl_ros.nodes.start import {name}; sys.exit({name}())"
     running = subprocess.Popen(
-        [sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", code, *arguments],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     try:
         yield running
@@ -104,8 +107,9 @@ def measure_pace(folder: Path) -> None:
             QoSProfile(depth=RELIABLE.depth),
             raw=True,
         )
-    with process("replay_node", str(folder / "paced")):
+    with process("replay_node", str(folder / "paced")) as replay:
         spin_until(executor, lambda: len(arrived) == len(recorded))
+        replay.communicate(timeout=120)
     node.destroy_node()
     spaces = np.abs(np.diff(arrived) - np.diff(recorded) / 1e9) * 1e3
     drift = np.abs(np.array(arrived) - arrived[0] - (recorded - recorded[0]) / 1e9) * 1e3
@@ -152,11 +156,10 @@ def main() -> None:
     rclpy.init()
     try:
         with tempfile.TemporaryDirectory() as name:
-            print(
-                f"replay at {PACE} messages a second {'median':>16s} {'99 %':>8s} {'most':>8s}  [ms]"
-            )
+            title = f"replay at {PACE} messages a second"
+            print(f"{title:40s} {'median':>8s} {'99 %':>8s} {'most':>8s}  [ms]", flush=True)
             measure_pace(Path(name))
-            print("replay --fast to subgoal_node")
+            print("replay --fast to subgoal_node", flush=True)
             measure_speed(Path(name))
     finally:
         rclpy.try_shutdown()

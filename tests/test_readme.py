@@ -84,7 +84,7 @@ def test_commands_parse(arguments: list[str], capsys: pytest.CaptureFixture[str]
     # A command's bare name, in prose, gets something to work on, and all of them show their help.
     if arguments in (["infer"], ["predict"]):
         arguments = [*arguments, "bags/paper_loop"]
-    if arguments == ["replay"]:  # its options are replay_node's: see below
+    if arguments in (["replay"], ["record"]):  # their options are the nodes': see below
         return
     if "--help" in arguments:
         with pytest.raises(SystemExit, match=r"^0$"):
@@ -99,14 +99,15 @@ def test_there_are_commands_to_parse() -> None:
     assert ["infer", "bags/paper_loop", "--out", "result"] in arguments_of("bnirl")
 
 
-def test_replay_commands_parse() -> None:
+def test_commands_of_nodes_with_options_parse() -> None:
     pytest.importorskip("rclpy")
-    from bnirl_ros.nodes.replay_options import parse
+    from bnirl_ros.nodes import record_node, replay_options
 
-    replays = arguments_of("ros2", "run", "bnirl_ros", "replay_node")
-    assert replays
-    for arguments in replays:
-        parse(arguments)
+    for name, parse in (("replay_node", replay_options.parse), ("record_node", record_node.parse)):
+        found = arguments_of("ros2", "run", "bnirl_ros", name)
+        assert found
+        for arguments in found:
+            parse(arguments)
 
 
 def test_launch_arguments_are_declared() -> None:

@@ -183,7 +183,8 @@ def test_what_does_not_fit_the_bag_is_one_sentence(
 def test_what_people_know_from_ros2_bag_play_is_understood() -> None:
     line = (
         "a b -r 2 -l -d 1 --start-offset 3 --playback-duration 4 -p --topics /x y -e /z.* "
-        "--exclude-topics w -x .*v -m /x:=/u --qos-profile-overrides-path q.yaml --clock"
+        "--exclude-topics w -x .*v --longest-silence 5 -m /x:=/u "
+        "--qos-profile-overrides-path q.yaml --clock"
     )
     assert parse(line.split()) == Options(
         bags=(Path("a"), Path("b")),

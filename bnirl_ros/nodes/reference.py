@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from bnirl_ros.inference.settings import Settings
-from bnirl_ros.nodes import discretiser_node, subgoal_node
+from bnirl_ros.nodes import discretiser_node, record_node, replay_node, subgoal_node
 from bnirl_ros.nodes.managed import AUTOSTART, DIAGNOSTICS
 from bnirl_ros.nodes.parameters import NodeParameter, parameter_of
 from bnirl_ros.nodes.topics import NodeService, NodeTopic
@@ -26,7 +26,7 @@ info`, `ros2 param list` and `ros2 param describe` tell the same of a node that 
 Names without a leading slash are relative: they are in the node's namespace, and can be remapped.
 Those with `~/` are under the node's own name.
 
-## What both nodes have in common
+## What subgoal_node and discretiser_node have in common
 
 Both are managed nodes with the services `~/change_state` and `~/get_state` of lifecycle_msgs. A
 node that is not active hears and publishes nothing but `/diagnostics`; what it has gathered it
@@ -45,7 +45,6 @@ jumps back a new episode begins.
 What cannot be used is left out, counted by its fault, and told on `/diagnostics`, in the log the
 first time and at every tenfold.
 
-`replay_node --help` and `bnirl --help` tell of the programs that are no managed nodes.
 """
 
 _ON_SUBGOALS = """\
@@ -83,6 +82,39 @@ cells and actions are made.
 """
 
 
+_ON_REPLAYING = """\
+It is also `bnirl replay`, and no managed node but a program that ends with the bag; `--help` tells
+its options, which are those of `ros2 bag play` and some more. QoS, header stamps and bytes are as
+recorded. Several bags, and all bags in a folder, are played as one in the order of log time; a
+silence between them is cut to five seconds, see `--longest-silence`.
+
+It waits until every topic has a subscriber, and says for whom it waits; `--wait` limits that,
+`--topics` leaves out what nobody will hear, and `~/resume` begins at once. Beginning at
+`--start-offset`, and after `~/seek`, it first sends the last messages that were latched there. At
+the start of a bag the first latched messages of its first five seconds come first. With `--clock`,
+`/clock` is the log time of the recording, from the beginning on, also while it waits or is paused,
+and never ahead of a message that was not sent; it jumps back where the replay does.
+
+A service that needs a value takes it from a parameter, which has no effect by itself:
+
+    ros2 param set /replay_node seek_to 12.5
+    ros2 service call /replay_node/seek std_srvs/srv/Trigger
+
+Where something cannot be done, `success` is false and `message` says why; else it tells where the
+replay is. The last line on standard output tells how many messages of each topic were sent, and
+which were not and why.
+"""
+
+_ON_RECORDING = """\
+It is also `bnirl record`, and no managed node but a program that runs until it is stopped;
+`--help` tells its options. Without names it records what `subgoal_node` hears and publishes. A
+topic is heard from when somebody publishes it, with the most that all of its publishers offer in
+reliability and durability. The bag is a folder as of `ros2 bag record -s mcap`. It ends whole with
+SIGINT and SIGTERM, and when the disk is full. Where the process is killed the last two seconds may
+be missing, and metadata.yaml is. Types are those of `msg_schemas`.
+"""
+
+
 @dataclass(frozen=True)
 class _Page:
     """What there is to tell of a node."""
@@ -94,6 +126,7 @@ class _Page:
     outputs: Sequence[NodeTopic]
     services: Sequence[NodeService]
     parameters: Sequence[NodeParameter]
+    managed: bool = True
 
 
 _PAGES = (
@@ -115,6 +148,26 @@ _PAGES = (
         (),
         discretiser_node.PARAMETERS,
     ),
+    _Page(
+        "replay_node",
+        replay_node.ReplayNode.__doc__ or "",
+        _ON_REPLAYING,
+        (),
+        (),
+        replay_node.SERVICES,
+        replay_node.PARAMETERS,
+        managed=False,
+    ),
+    _Page(
+        "record_node",
+        record_node.RecordNode.__doc__ or "",
+        _ON_RECORDING,
+        (),
+        (),
+        (),
+        (),
+        managed=False,
+    ),
 )
 
 
@@ -126,12 +179,17 @@ def reference() -> str:
 def _section(page: _Page) -> str:
     first_line = page.summary.partition("\n")[0]
     parts = [f"## {page.name}\n\n{first_line}\n\n{page.notes}"]
-    parts.append("### Heard\n\n" + _topic_table(page.inputs))
-    parts.append("### Published\n\n" + _topic_table((*page.outputs, DIAGNOSTICS)))
+    outputs = (*page.outputs, DIAGNOSTICS) if page.managed else page.outputs
+    parameters = (AUTOSTART, *page.parameters) if page.managed else page.parameters
+    if page.inputs:
+        parts.append("### Heard\n\n" + _topic_table(page.inputs))
+    if outputs:
+        parts.append("### Published\n\n" + _topic_table(outputs))
     if page.services:
         rows = [(f"`{each.name}`", each.type_name, each.meaning) for each in page.services]
         parts.append("### Services\n\n" + _table(("service", "type", "what it does"), rows))
-    parts.append("### Parameters\n\n" + _parameter_table((AUTOSTART, *page.parameters)))
+    if parameters:
+        parts.append("### Parameters\n\n" + _parameter_table(parameters))
     return "\n".join(parts)
 
 

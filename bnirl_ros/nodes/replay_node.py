@@ -29,7 +29,7 @@ from bnirl_ros.maps import load_map
 from bnirl_ros.nodes.conversion import message_class, to_ros
 from bnirl_ros.nodes.parameters import Changeable, NodeParameter, declare
 from bnirl_ros.nodes.process import run, separated
-from bnirl_ros.nodes.replay_options import Options, absolute, parse
+from bnirl_ros.nodes.replay_options import BETWEEN_BAGS, Options, absolute, parse
 from bnirl_ros.nodes.topics import NodeService
 from bnirl_ros.views.belief import map_message
 
@@ -141,12 +141,15 @@ class ReplayNode(Node):
         (entry, *others) = PARAMETERS
         rate = options.rate if options.rate is not None else 1.0
         values = declare(self, (replace(entry, default=rate), *others))
+        silence = options.longest_silence
+        if silence is None and len(bags) > 1:
+            silence = BETWEEN_BAGS
         self._player = Player(
             self._source(),
             rate=None if options.rate is None else values["rate"],
             paused=options.paused,
             loop=options.loop,
-            longest_silence=options.longest_silence,
+            longest_silence=silence,
         )
         self._go_on = False  # without the subscribers that are waited for
         self._stopped = False

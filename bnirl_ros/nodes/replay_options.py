@@ -13,7 +13,8 @@ from bnirl_ros.limits import above_zero, one_or_more, zero_or_more
 CLOCK_RATE = 40.0
 """How often /clock is published unless it is said [Hz]."""
 
-_BETWEEN_BAGS = 5.0  # [s] to which a silence is cut where there are several bags
+BETWEEN_BAGS = 5.0
+"""To which a silence is cut where there are several bags, unless it is said [s]."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,8 @@ class Options:
         duration: how much of the recording to play [s]; None: all of it.
         paused: whether to begin only when `~/resume` is called.
         loop: whether to begin again at the end.
-        longest_silence: to which longer silences are cut [s]; None: to none.
+        longest_silence: to which longer silences are cut [s]; None: to `BETWEEN_BAGS` where there
+            are several bags, else to none.
         selection: the wanted topics.
         remaps: other names for topics, by the recorded ones.
         qos_overrides: a file with QoS by topic; None: all as recorded.
@@ -90,9 +92,6 @@ def absolute(topic: str) -> str:
 def parse(arguments: Sequence[str], name: str = "replay_node") -> Options:
     """The options on a command line without ROS arguments; wrong ones end with status 2."""
     given = _parser(name).parse_args(arguments)
-    silence = given.longest_silence
-    if silence is None and len(given.bags) > 1:
-        silence = _BETWEEN_BAGS
     return Options(
         bags=tuple(given.bags),
         rate=None if given.fast else given.rate,
@@ -104,7 +103,7 @@ def parse(arguments: Sequence[str], name: str = "replay_node") -> Options:
         duration=given.playback_duration,
         paused=given.start_paused,
         loop=given.loop,
-        longest_silence=silence,
+        longest_silence=given.longest_silence,
         selection=selection_of(given, given.topics),
         remaps=tuple(given.remap),
         qos_overrides=given.qos_profile_overrides_path,
@@ -189,8 +188,8 @@ def _parser(name: str) -> argparse.ArgumentParser:
         "--longest-silence",
         type=above_zero,
         metavar="SECONDS",
-        help=f"cut longer silences in the recording to this ({_BETWEEN_BAGS:g} if several bags "
-        "are named, else none is cut)",
+        help=f"cut longer silences in the recording to this ({BETWEEN_BAGS:g} where there are "
+        "several bags, else none is cut)",
     )
     when.add_argument(
         "--clock",
