@@ -228,12 +228,12 @@ class ReplayNode(Node):
         for topic in self._topic_publishers:
             self._wait_until_acknowledged(topic)
         passed = time.monotonic() - begun
+        self._clear_progress()
         self.get_logger().info(f"played {self.sent.total()} messages in {passed:.3f} s")
 
     def close(self) -> None:
         """Let go of everything."""
-        if self._told:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+        self._clear_progress()
         self._player.close()
         self._server.shutdown()
         self.destroy_node()
@@ -414,6 +414,10 @@ class ReplayNode(Node):
             self._progress_at = now + _PROGRESS_PERIOD
             line = f"{self._place()}, {self.sent.total()} messages"
             print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
+
+    def _clear_progress(self) -> None:
+        if self._told:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
 
     def _publish_clock(self) -> None:
         message = message_class(_CLOCK)()
