@@ -9,12 +9,14 @@ from typing import Any
 
 import pytest
 
+from bnirl_ros.bags.qos import LATCHED, QosProfile
 from bnirl_ros.demonstrations.messages import stamp_of
 from demonstration_support import SECOND, START, map_of_grid, walk, write_bag
 from ros_support import NodeProcess, Peer, parameter_services, services
 
 from bnirl_ros.nodes.conversion import message_class  # isort: skip  # needs rclpy
 from bnirl_ros.nodes.process import separated  # isort: skip
+from bnirl_ros.nodes.replay_node import joint_offer  # isort: skip
 from bnirl_ros.nodes.replay_options import Options, Selection, parse  # isort: skip
 
 import importlib  # isort: skip
@@ -175,6 +177,15 @@ def test_what_does_not_fit_the_bag_is_one_sentence(
     assert (end.status, end.out) == (1, "")
     assert end.err.count("\n") == 1
     assert words in end.err
+
+
+def test_one_publisher_stands_for_several() -> None:
+    best_effort, reliable = QosProfile(reliability="best_effort"), QosProfile(depth=7)
+    assert joint_offer([]) == QosProfile()
+    assert joint_offer([best_effort]) == best_effort
+    assert joint_offer([best_effort, reliable]) == reliable
+    assert joint_offer([LATCHED, LATCHED]) == LATCHED
+    assert joint_offer([LATCHED, reliable]).durability == "volatile"
 
 
 # The command line

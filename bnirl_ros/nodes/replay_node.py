@@ -321,7 +321,7 @@ class ReplayNode(Node):
         except (ImportError, ValueError):
             self._skip(topic, f"type {topic.type_name or 'unknown'} isn't installed")
             return
-        recorded = topic.qos[0] if topic.qos else QosProfile()
+        recorded = joint_offer(topic.qos)
         given = self._overrides.get(absolute(topic.name), {})
         qos = replace(recorded, **given)
         if qos.durability == LATCHED.durability:
@@ -451,6 +451,16 @@ def qos_profile(recorded: QosProfile) -> QoSProfile:
         if recorded.durability == "transient_local"
         else DurabilityPolicy.VOLATILE,
     )
+
+
+def joint_offer(recorded: Sequence[QosProfile]) -> QosProfile:
+    """What one publisher offers in place of several, so that all who heard them hear it."""
+    if not recorded:
+        return QosProfile()
+    first, *others = sorted(recorded, key=lambda each: each.reliability == "best_effort")
+    if any(each.durability != LATCHED.durability for each in others):
+        return replace(first, durability="volatile")
+    return first
 
 
 def _extent(bags: Bags) -> tuple[int, float]:
