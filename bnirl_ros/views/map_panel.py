@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,10 +26,36 @@ _FREE: Colour = (1.0, 1.0, 1.0)
 _GRID: Colour = (0.92, 0.93, 0.94)
 _SMALLEST_DOT = 2.6  # Diameter [pt].
 
-# An arrow along x from (0, 0) to (1, 0): (along, across as a share of its width) of each corner.
-_ARROW = np.array(
+ARROW = np.array(
     [[0.0, 0.5], [0.55, 0.5], [0.55, 1.35], [1.0, 0.0], [0.55, -1.35], [0.55, -0.5], [0.0, -0.5]]
 )
+"""An arrow from (0, 0) to (1, 0): (along, across as a share of its width) of each corner."""
+
+
+@dataclass(frozen=True, eq=False)
+class DistinctPairs:
+    """The distinct (cell, action) pairs that observations are made of, for each subgoal.
+
+    Attributes:
+        keys: (M, 4) x, y, action index, rank of the subgoal, in this order.
+        counts: (M,) how often each occurs.
+        turn: (M,) its place among those with the same cell and action, the most frequent first.
+        index: (N,) the row of each observation.
+    """
+
+    keys: npt.NDArray[np.int64]
+    counts: npt.NDArray[np.int64]
+    turn: npt.NDArray[np.int64]
+    index: npt.NDArray[np.int64]
+
+
+def distinct_pairs(
+    observations: npt.NDArray[np.int64], rank_of: npt.NDArray[np.int64]
+) -> DistinctPairs:
+    """The distinct pairs of observations (N, 4) with their ranks (N,)."""
+    every = np.column_stack([observations[:, 1:], rank_of]).reshape(-1, 4)
+    keys, index, counts = np.unique(every, axis=0, return_inverse=True, return_counts=True)
+    return DistinctPairs(keys, counts, _turns(keys[:, :3], counts), index.reshape(-1))
 
 
 def import_matplotlib() -> tuple[Any, Any]:
@@ -90,8 +117,8 @@ def draw_observations(
         cell: edge of a cell on paper [pt].
         colour: of a rank.
     """
-    keys = np.column_stack([observations[:, 1:], rank_of]).reshape(-1, 4)
-    distinct, counts = np.unique(keys, axis=0, return_counts=True)
+    pairs = distinct_pairs(observations, rank_of)
+    distinct, counts, turn = pairs.keys, pairs.counts, pairs.turn
     colours = np.array([colour(rank) for rank in distinct[:, 3].tolist()]).reshape(-1, 3)
     steps = STEPS[distinct[:, 2]]
     if cell < ARROWS_FROM:
@@ -110,7 +137,6 @@ def draw_observations(
 
     # Where several subgoals share a (cell, action) pair, each next one lies on the one before it
     # and is slimmer, so that all are seen.
-    turn = _turns(distinct[:, :3], counts)
     width = np.sqrt(counts / counts.max(initial=1)) * 0.6**turn
     moves = steps.any(axis=1)
     for layer in range(turn.max(initial=-1) + 1):
@@ -155,6 +181,6 @@ def _arrows(
     across = np.column_stack([-along[:, 1], along[:, 0]])
     return np.asarray(
         cells[:, np.newaxis, :]
-        + 0.46 * _ARROW[:, :1] * (along * np.sqrt(length))[:, np.newaxis, :]
-        + _ARROW[:, 1:] * (across * widths[:, np.newaxis])[:, np.newaxis, :]
+        + 0.46 * ARROW[:, :1] * (along * np.sqrt(length))[:, np.newaxis, :]
+        + ARROW[:, 1:] * (across * widths[:, np.newaxis])[:, np.newaxis, :]
     )

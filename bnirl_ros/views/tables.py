@@ -43,7 +43,7 @@ def subgoal_columns(
     """
     columns = {
         "rank": [str(subgoal.rank) for subgoal in subgoals],
-        _heading(subgoals): [_what(subgoal) for subgoal in subgoals],
+        _heading(subgoals): [what_of(subgoal) for subgoal in subgoals],
         "place [m]": ["({:.2f}, {:.2f})".format(*subgoal.position) for subgoal in subgoals],
         "probability": [f"{subgoal.probability:.2f}" for subgoal in subgoals],
         "observations": [str(subgoal.observations) for subgoal in subgoals],
@@ -60,7 +60,8 @@ def _heading(subgoals: Sequence[Subgoal]) -> str:
     return "feature" if any(subgoal.feature is not None for subgoal in subgoals) else "cell"
 
 
-def _what(subgoal: Subgoal) -> str:
+def what_of(subgoal: Subgoal) -> str:
+    """A subgoal in words: its cell, or the name or the coordinates of its feature."""
     return subgoal.name or "({})".format(", ".join(map(str, subgoal.feature or subgoal.cell)))
 
 
@@ -70,11 +71,16 @@ def parameter_table(parameters: Sequence[Parameter]) -> str:
         (
             parameter.name,
             f"{parameter.median:.3g}",
-            "{:.3g} to {:.3g}".format(*parameter.interval) if parameter.inferred else "fixed",
+            interval_of(parameter),
         )
         for parameter in parameters
     ]
     return aligned([("parameter", "median", "90 % interval"), *rows])
+
+
+def interval_of(parameter: Parameter) -> str:
+    """The interval of a parameter in words, or 'fixed'."""
+    return "{:.3g} to {:.3g}".format(*parameter.interval) if parameter.inferred else "fixed"
 
 
 def aligned(table: Sequence[Sequence[str]]) -> str:
@@ -109,9 +115,13 @@ def topic_table(topics: Sequence[Topic], motion: Sequence[Topic]) -> str:
 
 def convergence(summary: Summary) -> str:
     """One line on how many observations there were and how far the chains agree."""
-    rhat = "undefined" if summary.rhat is None else f"{summary.rhat:.3f}"
-    size = "undefined" if summary.ess is None else f"{summary.ess:.0f}"
     return (
         f"{len(summary.observations)} observations, {summary.chains} chains of {summary.draws} "
-        f"draws, R-hat {rhat}, effective sample size {size}"
+        f"draws, R-hat {known(summary.rhat, '.3f')}, effective sample size "
+        f"{known(summary.ess, '.0f')}"
     )
+
+
+def known(value: float | None, form: str) -> str:
+    """A number in a format, or that there is none."""
+    return "undefined" if value is None else format(value, form)
