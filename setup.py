@@ -45,6 +45,7 @@ EXTRAS = {
         "pytest>=7.4",
         "pytest-timeout>=2.2",
         "pytest-xdist>=3.5",  # Half of the time is waiting, between processes: two at once.
+        "selenium>=4.15",  # Shows report.html to a browser, where there is one.
         "setuptools",  # Python 3.12 has none of its own, and a test reads setup.py.
         # A newer one finds more to say, and this tree must pass tomorrow as it does today.
         "mypy==2.4.*",
@@ -87,6 +88,7 @@ setup(
     ],
     python_requires=">=3.11",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    package_data={f"{NAME}.views": ["*.css", "*.html", "*.js"]},
     data_files=shared_files(),
     install_requires=REQUIREMENTS,
     extras_require=EXTRAS,

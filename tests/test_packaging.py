@@ -143,6 +143,21 @@ def test_all_packages_are_installed(setup_arguments: dict[str, Any]) -> None:
     }
 
 
+def test_files_beside_the_modules_are_installed(setup_arguments: dict[str, Any]) -> None:
+    beside = {
+        path
+        for path in (ROOT / "bnirl_ros").rglob("*.*")
+        if path.is_file() and path.suffix != ".py" and "__pycache__" not in path.parts
+    }
+    assert beside
+    assert beside == {
+        path
+        for package, patterns in setup_arguments["package_data"].items()
+        for pattern in patterns
+        for path in ROOT.joinpath(*package.split(".")).glob(pattern)
+    }
+
+
 def test_all_shared_files_are_installed(setup_arguments: dict[str, Any]) -> None:
     installed = {
         Path(folder, Path(file).name): ROOT / file

@@ -20,6 +20,9 @@ def add(commands: Any) -> None:
     """The subcommand and its options."""
     parser = commands.add_parser("infer", help="infer the subgoals of a recorded demonstration")
     add_inference(parser)
+    parser.add_argument(
+        "--report", action="store_true", help="also write report.html, a page to hand round"
+    )
     parser.set_defaults(run=_infer, command=parser)
 
 
@@ -38,7 +41,8 @@ def _infer(options: argparse.Namespace) -> int:
     Thread(target=import_matplotlib, daemon=True).start()  # while the chains leave the GIL alone
     posterior = inferred(demonstration, grid_map, settings)
     summary = summarise(posterior, grid_map)
-    written = write_results(options.out, posterior, summary, grid_map, settings)
+    title = options.demonstration.resolve().name if options.report else None
+    written = write_results(options.out, posterior, summary, grid_map, settings, title)
     print(report(summary))
     print(f"Written: {', '.join(str(file) for file in written)}")
     return told_of(damage)

@@ -1,4 +1,4 @@
-"""The result files of an inference: subgoals.json, posterior.npz and subgoals.png."""
+"""The result files of an inference: subgoals.json, posterior.npz, subgoals.png, report.html."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from bnirl_ros.maps.grid_map import GridMap
 from bnirl_ros.model.pursuits import PRIORS
 from bnirl_ros.views.plot import draw_summary
 from bnirl_ros.views.pursuits import knows_pursuits, pursuits_by_episode
+from bnirl_ros.views.report import report_page
 from bnirl_ros.views.waypoints import Visits, visits_in_order
 
 FORMAT = 1
@@ -33,8 +34,11 @@ def write_results(
     summary: Summary,
     grid_map: GridMap,
     settings: Settings,
+    report_title: str | None = None,
 ) -> list[Path]:
     """Write the three result files, each whole or not at all; returns their paths.
+
+    With a title, report.html is written too, the page that `report_page` makes.
 
     Raises:
         InputError: the folder cannot be written to.
@@ -45,6 +49,9 @@ def write_results(
         "posterior.npz": lambda path: write_arrays(path, posterior_arrays(posterior)),
         "subgoals.png": lambda path: draw_summary(summary, grid_map, path),
     }
+    if report_title is not None:
+        page = report_page(posterior, summary, grid_map, report_title)
+        writers["report.html"] = lambda path: path.write_text(page, encoding="utf-8")
     return write_whole(folder, writers)
 
 
