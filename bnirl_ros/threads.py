@@ -22,9 +22,9 @@ def compute_behind_others() -> None:
     _behind_others.set(True)
 
 
-def workers(tasks: int) -> ThreadPoolExecutor:
-    """Threads for so many tasks side by side: one for each, or for each core."""
-    count = max(1, min(tasks, os.cpu_count() or 1))
+def workers(tasks: int, threads: int | None = None) -> ThreadPoolExecutor:
+    """Threads for so many tasks side by side: one for each, or `threads`, or one for each core."""
+    count = max(1, min(tasks, threads or os.cpu_count() or 1))
     return ThreadPoolExecutor(count, initializer=_step_back if _behind_others.get() else None)
 
 

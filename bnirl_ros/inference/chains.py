@@ -27,8 +27,11 @@ def run_chains(
     settings: Settings,
     progress: Progress | None = None,
     stop: Event | None = None,
+    threads: int | None = None,
 ) -> Draws:
     """Draws (chain, draw, N) of fresh chains, each with a generator of its own from the seed.
+
+    `threads` is how many chains run at the same time; by default one on each core.
 
     Raises:
         StoppedError: `stop` was set meanwhile.
@@ -56,9 +59,9 @@ def run_chains(
                 progress(len(part) * thin)
 
     seeds = np.random.SeedSequence(settings.seed).spawn(settings.chains)
-    with workers(settings.chains) as threads:
+    with workers(settings.chains, threads) as executor:
         try:
-            list(threads.map(run_chain, range(settings.chains), seeds))
+            list(executor.map(run_chain, range(settings.chains), seeds))
         except BaseException:
             stop.set()  # Ctrl-C should not wait for the chains' end
             raise

@@ -181,6 +181,7 @@ def infer(
     settings: Settings,
     progress: Progress | None = None,
     stop: Event | None = None,
+    threads: int | None = None,
 ) -> Posterior:
     """Sample the posterior of a demonstration's subgoals with fresh chains from the seed.
 
@@ -193,6 +194,7 @@ def infer(
         settings: model and sampling settings.
         progress: told of sweeps as they are done, from several threads.
         stop: set it to give up between sweeps.
+        threads: how many chains run at the same time; by default one on each core.
 
     Raises:
         InputError: there is no observation, or features do not cover what was visited.
@@ -201,5 +203,5 @@ def infer(
     if len(demonstration) == 0:
         raise InputError("there is no observation to infer from; a pose and an action make one")
     candidates, model = model_of(demonstration, grid_map, settings)
-    draws = run_chains(model, settings, progress, stop)
+    draws = run_chains(model, settings, progress, stop, threads)
     return posterior_of(candidates, demonstration, model, draws, settings)
