@@ -27,6 +27,10 @@ REQUIREMENTS = [
 ]
 
 EXTRAS = {
+    # A cluster to infer on, of which `bnirl infer --scheduler` is a client.
+    "dask": [
+        "distributed>=2024.1",
+    ],
     # What the algorithms need that the paper compares with, and nothing else does.
     "paper": [
         "clarabel>=0.9",  # Quadratic programs with cones; Apache-2.0, wheels for any Python 3.

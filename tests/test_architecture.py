@@ -21,6 +21,7 @@ ORDER = [
     {"baselines"},
     {"bags"},
     {"views"},
+    {"fleet"},
     {"experiments"},
     {"nodes"},
     {"cli"},

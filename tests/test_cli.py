@@ -1038,9 +1038,9 @@ def test_predict_has_every_option_of_infer(bnirl: Command) -> None:
         command: set(re.findall(r"^  (--[a-z-]+)", bnirl(command, "--help").out, re.MULTILINE))
         for command in ("infer", "predict")
     }
-    many = {"--each", "--jobs", "--scheduler"}
+    of_infer = {"--report", "--each", "--jobs", "--scheduler"}
     assert told["predict"] - told["infer"] == {"--held-out", "--cell"}
-    assert told["infer"] - told["predict"] == many
+    assert told["infer"] - told["predict"] == of_infer
 
 
 # Stopping it

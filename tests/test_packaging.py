@@ -114,7 +114,8 @@ def test_setup_py_requires_what_is_imported(setup_arguments: dict[str, Any]) -> 
         if package not in {*sys.stdlib_module_names, "bnirl_ros"} and not is_ros(package)
     }
     required = names(setup_arguments["install_requires"])
-    assert imported == required | names(setup_arguments["extras_require"]["paper"])
+    extras = setup_arguments["extras_require"]
+    assert imported == required | names(extras["dask"]) | names(extras["paper"])
 
 
 def test_there_is_one_version(

@@ -226,7 +226,8 @@ def test_subgoals_are_as_told(command: list[str], output: str) -> None:
     discretising = Discretising(
         start=options.start, planning_resolution=options.planning_resolution
     )
-    recorded, words = read_raw_demonstration(ROOT / options.demonstration, discretising)
+    (demonstration,) = options.demonstrations
+    recorded, words = read_raw_demonstration(ROOT / demonstration, discretising)
     assert recorded.grid_map is not None
     if "Discretised" in output:
         assert f"Discretised: {words}\n" in output

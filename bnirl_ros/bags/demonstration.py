@@ -26,6 +26,8 @@ class RecordedDemonstration:
         faults: how often each fault occurred among the messages that cannot be used.
         warnings: sentences on what is wrong with the bag, but loses nothing.
         damage: a sentence on where the bag is damaged and what is lost; None for a sound one.
+        opened: cells (x, y) of the map that are free only since the robot was in them.
+        map_is_assumed: whether the map is open space that was taken for lack of any.
     """
 
     recording: Recording
@@ -33,6 +35,8 @@ class RecordedDemonstration:
     faults: Counter[str]
     warnings: tuple[str, ...]
     damage: str | None
+    opened: tuple[tuple[int, int], ...] = ()
+    map_is_assumed: bool = False
 
 
 def read_demonstration(

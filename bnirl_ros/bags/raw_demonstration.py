@@ -210,6 +210,8 @@ def read_raw_demonstration(
         faults=reading.faults + discretiser.faults,
         warnings=(*reading.bag.warnings, *reading.warnings),
         damage=reading.bag.damage,
+        opened=tuple(discretiser.opened),
+        map_is_assumed=grid_map is None,
     )
     return demonstration, words
 

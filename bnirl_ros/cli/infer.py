@@ -1,12 +1,14 @@
-"""`bnirl infer`: from a file to the three result files and a table."""
+"""`bnirl infer`: from files to the three result files and a table."""
 
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from threading import Thread
 from typing import Any
 
 from bnirl_ros.cli.inference import (
+    DEMONSTRATION,
     add_inference,
     inferred,
     read,
@@ -14,34 +16,47 @@ from bnirl_ros.cli.inference import (
     settings_of,
     told_of,
 )
+from bnirl_ros.cli.many import add_many, infer_many
 
 
 def add(commands: Any) -> None:
     """The subcommand and its options."""
-    parser = commands.add_parser("infer", help="infer the subgoals of a recorded demonstration")
+    parser = commands.add_parser("infer", help="infer the subgoals of recorded demonstrations")
+    parser.add_argument(
+        "demonstrations",
+        metavar="DEMO",
+        nargs="+",
+        type=Path,
+        help=f"{DEMONSTRATION}; several are pooled into one posterior",
+    )
     add_inference(parser)
     parser.add_argument(
         "--report", action="store_true", help="also write report.html, a page to hand round"
     )
+    add_many(parser)
     parser.set_defaults(run=_infer, command=parser)
 
 
 def _infer(options: argparse.Namespace) -> int:
-    """`bnirl infer`: from a file to the three result files and a table."""
+    """`bnirl infer`: from files to the three result files and a table."""
     settings = settings_of(options.command, options)
     remappings = remappings_of(options.command, options.remap)
+    if len(options.demonstrations) > 1 or options.each or options.scheduler:
+        return infer_many(options, settings, remappings)
 
     from bnirl_ros.inference.summary import summarise
     from bnirl_ros.views.map_panel import import_matplotlib
+    from bnirl_ros.views.report import title_of
     from bnirl_ros.views.results import check_writable, write_results
     from bnirl_ros.views.tables import report
 
+    (options.demonstration,) = options.demonstrations
     demonstration, grid_map, damage = read(options, settings, remappings)
     check_writable(options.out)
     Thread(target=import_matplotlib, daemon=True).start()  # while the chains leave the GIL alone
     posterior = inferred(demonstration, grid_map, settings)
     summary = summarise(posterior, grid_map)
-    title = options.demonstration.resolve().name if options.report else None
+    title = title_of(options.demonstrations) if options.report else None
     written = write_results(options.out, posterior, summary, grid_map, settings, title)
     print(report(summary))
     print(f"Written: {', '.join(str(file) for file in written)}")

@@ -13,6 +13,7 @@ from bnirl_ros.errors import InputError
 
 if TYPE_CHECKING:
     from bnirl_ros.demonstrations.demonstration import Demonstration
+    from bnirl_ros.fleet.reading import Reading, Remark
     from bnirl_ros.inference.posterior import Posterior
     from bnirl_ros.inference.settings import Settings
     from bnirl_ros.maps.grid_map import GridMap
@@ -21,16 +22,17 @@ _Table = TypeVar("_Table", bound=Any)
 """A class of settings."""
 
 
+DEMONSTRATION = "rosbag2 folder, .mcap file or .csv"
+"""What may be inferred from."""
+
+
 def add_inference(parser: argparse.ArgumentParser) -> None:
-    """What is inferred from, and every option of an inference."""
+    """Every option of an inference."""
     from bnirl_ros.demonstrations.discretising import Discretising
     from bnirl_ros.demonstrations.placement import EPISODE_GAP
     from bnirl_ros.inference.settings import Settings
     from bnirl_ros.limits import above_zero
 
-    parser.add_argument(
-        "demonstration", metavar="DEMO", type=Path, help="rosbag2 folder, .mcap file or .csv"
-    )
     parser.add_argument(
         "--map", type=Path, help="Nav2 map .yaml or text grid .txt; wins over a map in the bag"
     )
@@ -119,19 +121,26 @@ def read(
     options: argparse.Namespace, settings: Settings, remappings: Mapping[str, str]
 ) -> tuple[Demonstration, GridMap, str | None]:
     """The demonstration, its map, and a sentence on damage to the file, if there is any."""
-    from bnirl_ros.maps import load_features, load_map, with_features
+    from bnirl_ros.maps import load_features, with_features
 
     path: Path = options.demonstration
-    given_map = load_map(options.map) if options.map else None
+    given_map = map_of(options, [path])
     features = load_features(options.features) if options.features else None
-    if given_map is None and _is_csv(path):
-        options.command.error(f"{path}: a CSV file tells no map; give one with --map")
     demonstration, grid_map, damage = placed(path, given_map, options, settings, remappings)
     return demonstration, with_features(grid_map, features) if features else grid_map, damage
 
 
-def _is_csv(path: Path) -> bool:
-    return path.suffix.lower() == ".csv"
+def map_of(options: argparse.Namespace, paths: Sequence[Path]) -> GridMap | None:
+    """The map that was given, if any; it has to be for a CSV file."""
+    from bnirl_ros.fleet.reading import is_csv
+    from bnirl_ros.maps import load_map
+
+    if options.map:
+        return load_map(options.map)
+    for path in paths:
+        if is_csv(path):
+            options.command.error(f"{path}: a CSV file tells no map; give one with --map")
+    return None
 
 
 def placed(
@@ -147,42 +156,40 @@ def placed(
     A raw bag is put on a planning map that is made of the given one, unless that is to be taken
     as given.
     """
-    if given_map is not None and _is_csv(path):
-        from bnirl_ros.demonstrations.csv_file import read_csv
+    from bnirl_ros.fleet.reading import read
 
-        return read_csv(path, given_map, settings.moves), given_map, None
+    reading = reading_of(options, settings, remappings, given_map, as_given)
+    found = read(path, reading, told)
+    return found.demonstration, found.grid_map, found.damage
 
-    from bnirl_ros.bags.demonstration import read_demonstration
-    from bnirl_ros.bags.raw_demonstration import is_raw, read_raw_demonstration
+
+def reading_of(
+    options: argparse.Namespace,
+    settings: Settings,
+    remappings: Mapping[str, str],
+    given_map: GridMap | None,
+    as_given: bool = False,
+) -> Reading:
+    """How demonstrations are to be read, by the options."""
     from bnirl_ros.demonstrations.discretising import Discretising
-    from bnirl_ros.demonstrations.placement import place
+    from bnirl_ros.fleet.reading import Reading
 
-    discretising = table_of(Discretising, options.command, options)
-    episode_gap = options.episode_gap
-    if is_raw(path, discretising, remappings):
-        recorded, words = read_raw_demonstration(
-            path, discretising, given_map, settings.moves, remappings.get("map", "map")
-        )
-        print(f"Discretised: {words}")
-        grid_map = given_map if as_given else recorded.grid_map
-        episode_gap = discretising.longest_silence
+    return Reading(
+        moves=settings.moves,
+        discretising=table_of(Discretising, options.command, options),
+        episode_gap=options.episode_gap,
+        remappings=remappings,
+        grid_map=given_map,
+        as_given=as_given,
+    )
+
+
+def told(remark: Remark) -> None:
+    """Say what there is to say of a demonstration that was read."""
+    if remark.is_warning:
+        warn(remark.sentence)
     else:
-        recorded = read_demonstration(path, remappings)
-        grid_map = given_map or recorded.grid_map
-    for warning in recorded.warnings:
-        warn(warning)
-    if grid_map is None:
-        reasons = "".join(f" ({fault})" for fault in recorded.faults if "map" in fault)
-        raise InputError(f"{path}: has no map that can be used{reasons}; give one with --map")
-    placement = place(recorded.recording, grid_map, settings.moves, episode_gap)
-    for fault, count in (recorded.faults + placement.faults).items():
-        warn(f"{path}: left out {count} x {fault}")
-    if len(placement.demonstration) == 0:
-        raise InputError(
-            f"{path}: {recorded.damage or 'no pose and action of equal stamps lie on the map'}; "
-            "check its topics, their frame and the map"
-        )
-    return placement.demonstration, grid_map, recorded.damage
+        print(remark.sentence)
 
 
 def inferred(demonstration: Demonstration, grid_map: GridMap, settings: Settings) -> Posterior:
@@ -197,5 +204,10 @@ def inferred(demonstration: Demonstration, grid_map: GridMap, settings: Settings
 def told_of(damage: str | None) -> int:
     """Exit status 0, unless a file was damaged, which is told last."""
     if damage:
-        raise InputError(f"{damage}; the results are from what could be read")
+        raise InputError(in_spite_of(damage))
     return 0
+
+
+def in_spite_of(damage: str) -> str:
+    """The sentence on damage to a file that was used all the same."""
+    return f"{damage}; the results are from what could be read"

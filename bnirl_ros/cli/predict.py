@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bnirl_ros.cli.inference import (
+    DEMONSTRATION,
     add_inference,
     inferred,
     placed,
@@ -39,6 +40,7 @@ def add(commands: Any) -> None:
         "action of others, given its episode so far, or what is done first by who begins in a "
         "cell.",
     )
+    parser.add_argument("demonstration", metavar="DEMO", type=Path, help=DEMONSTRATION)
     add_inference(parser)
     foreseen = parser.add_mutually_exclusive_group()
     foreseen.add_argument(

@@ -11,6 +11,7 @@ from dataclasses import fields
 from html import escape
 from importlib.resources import files
 from io import BytesIO
+from pathlib import Path
 from string import Template
 from typing import Any
 
@@ -43,6 +44,16 @@ _MOST_DRAWS = 1000
 
 _AGREE, _NEARLY_AGREE = 1.01, 1.05
 """R-hat up to which chains are said to; the first is that of Vehtari et al. (2021)."""
+
+_MOST_NAMES = 3
+"""Demonstrations that a title names: more are counted."""
+
+
+def title_of(paths: Sequence[Path]) -> str:
+    """The title for a page of what was inferred from these files together."""
+    if len(paths) > _MOST_NAMES:
+        return f"{len(paths)} demonstrations"
+    return ", ".join(path.resolve().name for path in paths)
 
 
 def report_page(posterior: Posterior, summary: Summary, grid_map: GridMap, title: str) -> str:

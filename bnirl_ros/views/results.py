@@ -79,6 +79,19 @@ def write_whole(folder: Path, writers: Mapping[str, Callable[[Path], object]]) -
     return [folder / name for name in writers]
 
 
+def write_contents(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:
+    """Write files, each whole or not at all, whose contents are given by name.
+
+    Raises:
+        InputError: the folder cannot be written to.
+    """
+
+    def writer(content: bytes) -> Callable[[Path], object]:
+        return lambda path: path.write_bytes(content)
+
+    return write_whole(folder, {name: writer(content) for name, content in contents.items()})
+
+
 def check_writable(folder: Path) -> None:
     """Find out whether results can be written, before time is spent on them.
 
@@ -142,8 +155,8 @@ def subgoals_document(summary: Summary, grid_map: GridMap, settings: Settings) -
         **_pursuits(summary),
         **_parameters(summary),
         "diagnostics": {
-            "rhat": _finite(summary.rhat),
-            "ess": _finite(summary.ess),
+            "rhat": finite(summary.rhat),
+            "ess": finite(summary.ess),
             "chains": summary.chains,
             "draws": summary.draws,
         },
@@ -323,6 +336,6 @@ def write_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
                 write_array(file, np.ascontiguousarray(values), allow_pickle=False)
 
 
-def _finite(value: float | None) -> float | None:
+def finite(value: float | None) -> float | None:
     """JSON has no infinity: chains that each stand still have no variance to judge by."""
     return value if value is not None and math.isfinite(value) else None

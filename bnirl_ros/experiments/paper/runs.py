@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import multiprocessing
-import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
-from threading import current_thread, main_thread
 from typing import TypeVar
+
+from bnirl_ros.fleet.processes import sparing_children
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -41,7 +40,7 @@ def run_all(
     # A process that was forked could inherit a lock from a thread that it does not have.
     executor = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
     try:
-        with _sparing_children():
+        with sparing_children():
             numbers = {executor.submit(run, job): number for number, job in enumerate(jobs)}
         for done in as_completed(numbers):
             results[numbers[done]] = done.result()
@@ -54,19 +53,3 @@ def run_all(
         raise
     executor.shutdown()
     return [results[number] for number in range(len(jobs))]
-
-
-@contextmanager
-def _sparing_children() -> Iterator[None]:
-    """Processes that are started meanwhile take no notice of Ctrl-C, which is for their parent.
-
-    They would each write a traceback.
-    """
-    if current_thread() is not main_thread():  # only there handlers can be set
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
