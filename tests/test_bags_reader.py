@@ -13,7 +13,8 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from bag_support import SHARED_BAGS, needs_shared_bags
-from bnirl_ros.bags.reader import Bag, RawMessage
+from bnirl_ros.bags.reader import Bag
+from bnirl_ros.bags.topics import RawMessage
 from bnirl_ros.errors import InputError
 
 

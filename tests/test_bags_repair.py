@@ -13,8 +13,9 @@ from rosbags.rosbag2 import Reader
 
 from bag_support import SHARED_BAGS, needs_shared_bags
 from bnirl_ros.bags.inspection import inspect, why_not_read
-from bnirl_ros.bags.reader import Bag, RawMessage, Topic
+from bnirl_ros.bags.reader import Bag
 from bnirl_ros.bags.repair import repair
+from bnirl_ros.bags.topics import RawMessage, Topic
 from bnirl_ros.cli import main
 from bnirl_ros.errors import InputError
 from test_bags_reader import write_mcap

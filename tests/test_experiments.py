@@ -13,7 +13,8 @@ import zstandard
 
 from bag_support import SHARED_BAGS, needs_shared_bags
 from bnirl_ros.bags.demonstration import read_demonstration
-from bnirl_ros.bags.reader import Bag, RawMessage
+from bnirl_ros.bags.reader import Bag
+from bnirl_ros.bags.topics import RawMessage
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.demonstrations.placement import place
 from bnirl_ros.errors import InputError

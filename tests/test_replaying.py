@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from bnirl_ros.bags.player import Player, Source
 from bnirl_ros.bags.qos import LATCHED, RELIABLE
 from bnirl_ros.bags.read_ahead import ReadAhead
-from bnirl_ros.bags.reader import RawMessage
 from bnirl_ros.bags.several import Bags, bags_in, latched_at
+from bnirl_ros.bags.topics import RawMessage
 from bnirl_ros.bags.writer import BagWriter
 from bnirl_ros.demonstrations.messages import TOPIC_TYPES
 from bnirl_ros.errors import InputError

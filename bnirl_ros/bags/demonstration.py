@@ -10,6 +10,7 @@ from types import MappingProxyType
 
 from bnirl_ros.bags.cdr import decode
 from bnirl_ros.bags.reader import Bag
+from bnirl_ros.bags.topics import absolute
 from bnirl_ros.demonstrations.messages import TOPIC_TYPES, map_of, take_action, take_pose
 from bnirl_ros.demonstrations.recording import Recorder, Recording
 from bnirl_ros.errors import InputError
@@ -103,8 +104,3 @@ def _without(topic: str, name: str, types: Mapping[str, str], bag: Bag) -> str:
         f"{bag.path}: has no topic {wanted}, only {there}; "
         f"name the right one with --remap {name}:=/topic"
     )
-
-
-def absolute(topic: str) -> str:
-    """A topic's name with the leading slash that bags record."""
-    return topic if topic.startswith("/") else f"/{topic}"

@@ -8,9 +8,9 @@ from pathlib import Path
 from types import MappingProxyType
 
 from bnirl_ros.bags.definitions import known_types
-from bnirl_ros.bags.demonstration import absolute
 from bnirl_ros.bags.raw_demonstration import action_topics, motion_topics
-from bnirl_ros.bags.reader import Bag, Topic
+from bnirl_ros.bags.reader import Bag
+from bnirl_ros.bags.topics import Topic, absolute
 from bnirl_ros.demonstrations.messages import TOPIC_TYPES
 from bnirl_ros.demonstrations.raw_messages import COMMAND_TYPES, TF
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
-from bnirl_ros.bags.reader import RawMessage
+from bnirl_ros.bags.topics import RawMessage
 
 _SECOND = 10**9  # [ns]
 

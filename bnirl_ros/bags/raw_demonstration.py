@@ -14,8 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from bnirl_ros.bags.cdr import decode
-from bnirl_ros.bags.demonstration import RecordedDemonstration, absolute
-from bnirl_ros.bags.reader import Bag, Topic
+from bnirl_ros.bags.demonstration import RecordedDemonstration
+from bnirl_ros.bags.reader import Bag
+from bnirl_ros.bags.topics import Topic, absolute
 from bnirl_ros.demonstrations.discretising import Discretising
 from bnirl_ros.demonstrations.frames import TransformBuffer, frame_name, moved
 from bnirl_ros.demonstrations.messages import TOPIC_TYPES, map_of, stamp_of

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Iterator
 from threading import Condition, Thread
 
-from bnirl_ros.bags.reader import RawMessage
+from bnirl_ros.bags.topics import RawMessage
 
 _BATCH = 64 * 1024  # [bytes] that are handed over together
 _OVERHEAD = 200  # [bytes] that a message takes besides its data

@@ -16,7 +16,8 @@ from mcap.records import Channel, Footer, Message, Schema, Statistics
 from mcap.stream_reader import MAGIC_SIZE
 
 from bnirl_ros.bags.definitions import full_type_name
-from bnirl_ros.bags.qos import HASH_KEY, QOS_KEY, QosProfile, parse_yaml, qos_from_yaml
+from bnirl_ros.bags.merging import Merging
+from bnirl_ros.bags.qos import HASH_KEY, QOS_KEY, parse_yaml, qos_from_yaml
 from bnirl_ros.bags.records import (
     MESSAGE_LIMIT,
     ChunkHead,
@@ -30,6 +31,7 @@ from bnirl_ros.bags.records import (
     unpacked_chunk,
 )
 from bnirl_ros.bags.sources import ENDINGS, is_packed, is_pipe, source_of
+from bnirl_ros.bags.topics import RawMessage, Topic, joined
 from bnirl_ros.bags.unpacking import IN_MEMORY, ZSTD_MAGIC, Packing, unpack
 from bnirl_ros.errors import InputError
 
@@ -39,62 +41,6 @@ _SQLITE_MAGIC = b"SQLite format 3\0"
 _ROS_1_MAGIC = b"#ROSBAG V2.0\n"
 # The second comes with rosbags, which this package needs: there may be no ROS.
 _CONVERTERS = "`ros2 bag convert` or `rosbags-convert`"
-
-
-@dataclass(frozen=True)
-class Topic:
-    """A topic of a bag.
-
-    Attributes:
-        name: as recorded.
-        type_name: `package/msg/Type`; empty where the bag doesn't say.
-        messages: how many, as far as the bag says or could be read.
-        qos: what each of its publishers offered; empty where the bag doesn't say.
-        encoding: of its messages' bytes; only `cdr` can be decoded.
-        type_hash: `RIHS01_...`; empty where the bag doesn't say.
-        schema: the definition of its type as recorded; None where the bag has none.
-        metadata: what else the bag says of it, as recorded.
-    """
-
-    name: str
-    type_name: str
-    messages: int
-    qos: tuple[QosProfile, ...] = ()
-    encoding: str = "cdr"
-    type_hash: str = ""
-    schema: Schema | None = field(default=None, repr=False)
-    metadata: Mapping[str, str] = field(default_factory=dict, repr=False)
-
-    @property
-    def key(self) -> tuple[str, str, str]:
-        """What its messages have in common, and tells it from other topics of its name."""
-        return self.name, self.type_name, self.encoding
-
-
-class RawMessage(NamedTuple):
-    """A message as recorded.
-
-    Attributes:
-        topic, type_name: as those of its `Topic`.
-        log_time: when it was received [ns].
-        data: still encoded.
-        publish_time: when it was sent [ns].
-        sequence: its publisher's number for it; 0 where there is none.
-        encoding: of its data.
-    """
-
-    topic: str
-    type_name: str
-    log_time: int
-    data: bytes
-    publish_time: int = 0
-    sequence: int = 0
-    encoding: str = "cdr"
-
-    @property
-    def key(self) -> tuple[str, str, str]:
-        """That of its `Topic`."""
-        return self.topic, self.type_name, self.encoding
 
 
 class Bag:
@@ -199,10 +145,10 @@ class Bag:
         heapq.heapify(waiting)
         for file in self._files:
             file.messages_read = 0
-        merging: list[_Merging] = []
+        merging = Merging()
         while waiting:
             time, place, piece = heapq.heappop(waiting)
-            yield from _merged(merging, until=time)
+            yield from merging.messages(until=time)
             file = self._files[place[0]]
             if piece.head is not None and piece.size > IN_MEMORY:
                 for number, part in enumerate(file.parts_of(piece)):
@@ -212,9 +158,8 @@ class Bag:
             messages = file.messages_of(piece, wanted)
             if piece.time < first or piece.last_time > last:
                 messages = [each for each in messages if first <= each.log_time <= last]
-            if messages:
-                heapq.heappush(merging, _Merging(messages[0].log_time, place, 0, messages))
-        yield from _merged(merging, until=None)
+            merging.add(place, messages)
+        yield from merging.messages()
 
     def _find_files(self) -> dict[Path, int | None]:
         """The files, each with how many messages metadata.yaml says it has."""
@@ -225,7 +170,7 @@ class Bag:
             raise InputError(
                 f"{path}: does not exist; name a rosbag2 folder or an .mcap file that does"
             )
-        here = _files_in(path)
+        here = files_in(path)
         listed, warning = _listed_files(path)
         if warning is None:
             return listed
@@ -246,16 +191,7 @@ class _Waiting(NamedTuple):
     piece: _Piece
 
 
-class _Merging(NamedTuple):
-    """Messages in the order of time, of which the next one is the `following`th, from 0."""
-
-    time: int
-    place: tuple[int, ...]
-    following: int
-    messages: list[RawMessage]
-
-
-def _files_in(folder: Path) -> list[Path]:
+def files_in(folder: Path) -> list[Path]:
     """The files that may be of a bag, by name; where one was unpacked, only what came of it."""
     files = sorted(each for ending in ENDINGS for each in folder.glob(f"*{ending}"))
     return [file for file in files if not (is_packed(file) and file.with_suffix("") in files)]
@@ -299,50 +235,6 @@ def _counts_in(values: Mapping[str, Any], files: int) -> list[int | None]:
         counts = [values.get("message_count")] if files == 1 else []
     known = len(counts) == files and all(isinstance(count, int) for count in counts)
     return counts if known else [None] * files
-
-
-def joined(topics: Iterable[Topic]) -> list[Topic]:
-    """The topics by name, each once that several files, or channels of a file, hold."""
-    found: dict[tuple[str, str, str], Topic] = {}
-    for topic in topics:
-        known = found.get(topic.key)
-        found[topic.key] = topic if known is None else _joined(known, topic)
-    return [found[key] for key in sorted(found)]
-
-
-def _joined(first: Topic, second: Topic) -> Topic:
-    """One topic that two files, or two channels of a file, hold."""
-    return replace(
-        first,
-        messages=first.messages + second.messages,
-        qos=first.qos + tuple(new for new in second.qos if new not in first.qos),
-        type_hash=first.type_hash or second.type_hash,
-        schema=first.schema or second.schema,
-        metadata={**second.metadata, **first.metadata, **_joined_qos(first, second)},
-    )
-
-
-def _joined_qos(first: Topic, second: Topic) -> dict[str, str]:
-    """The recorded YAML of what the publishers of two topics offered."""
-    mine, theirs = (topic.metadata.get(QOS_KEY, "").strip() for topic in (first, second))
-    if not theirs or theirs in mine:
-        return {}
-    if not mine or not all(each.startswith("-") for each in (mine, theirs)):
-        return {QOS_KEY: theirs} if not mine else {}
-    return {QOS_KEY: f"{mine}\n{theirs}"}
-
-
-def _merged(merging: list[_Merging], until: int | None) -> Iterator[RawMessage]:
-    """Take messages from a heap of sorted lists, up to a time; None takes all."""
-    while merging and (until is None or merging[0].time < until):
-        _, place, index, messages = merging[0]
-        yield messages[index]
-        index += 1
-        if index == len(messages):
-            heapq.heappop(merging)
-        else:
-            after = _Merging(messages[index].log_time, place, index, messages)
-            heapq.heapreplace(merging, after)
 
 
 @dataclass(frozen=True)

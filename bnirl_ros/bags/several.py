@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import heapq
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
 
-from bnirl_ros.bags.reader import Bag, RawMessage, Topic, joined
+from bnirl_ros.bags.merging import Merging
+from bnirl_ros.bags.reader import Bag, files_in
+from bnirl_ros.bags.topics import RawMessage, Topic, joined
 
 
 class Bags:
@@ -60,15 +61,13 @@ class Bags:
     ) -> Iterator[RawMessage]:
         """As `Bag.messages`, of all bags. A bag is read only when its time comes."""
         wanted = None if topics is None else frozenset(topics)
-        merging: list[tuple[int, int, RawMessage, Iterator[RawMessage]]] = []
+        merging = Merging()
         for number, (bag, span) in enumerate(zip(self._bags, self._spans, strict=True)):
             if span is None:
                 continue
-            yield from _merged(merging, until=span[0])
-            messages = bag.messages(wanted, since, until)
-            if message := next(messages, None):
-                heapq.heappush(merging, (message.log_time, number, message, messages))
-        yield from _merged(merging, until=None)
+            yield from merging.messages(until=span[0])
+            merging.add((number,), bag.messages(wanted, since, until))
+        yield from merging.messages()
 
 
 def bags_in(path: Path) -> list[Path]:
@@ -80,20 +79,7 @@ def bags_in(path: Path) -> list[Path]:
 
 
 def _is_bag(folder: Path) -> bool:
-    return (folder / "metadata.yaml").is_file() or any(folder.glob("*.mcap*"))
-
-
-def _merged(
-    merging: list[tuple[int, int, RawMessage, Iterator[RawMessage]]], until: int | None
-) -> Iterator[RawMessage]:
-    """Take messages from a heap of iterators, up to a time; None takes all."""
-    while merging and (until is None or merging[0][0] < until):
-        _, number, message, messages = merging[0]
-        yield message
-        if following := next(messages, None):
-            heapq.heapreplace(merging, (following.log_time, number, following, messages))
-        else:
-            heapq.heappop(merging)
+    return (folder / "metadata.yaml").is_file() or bool(files_in(folder))
 
 
 def latched_at(

@@ -12,7 +12,7 @@ from bnirl_ros import __version__
 from bnirl_ros.bags.cdr import Message, encode
 from bnirl_ros.bags.definitions import full_type_name, message_definition, type_hash
 from bnirl_ros.bags.qos import HASH_KEY, QOS_KEY, QosProfile, qos_to_yaml
-from bnirl_ros.bags.reader import RawMessage, Topic
+from bnirl_ros.bags.topics import RawMessage, Topic
 from bnirl_ros.errors import InputError
 
 if TYPE_CHECKING:

@@ -21,8 +21,8 @@ from std_srvs.srv import Trigger
 from bnirl_ros.bags.player import Player, Source
 from bnirl_ros.bags.qos import LATCHED, QosProfile, read_overrides
 from bnirl_ros.bags.read_ahead import ReadAhead
-from bnirl_ros.bags.reader import RawMessage, Topic
 from bnirl_ros.bags.several import Bags, latched_at
+from bnirl_ros.bags.topics import RawMessage, Topic
 from bnirl_ros.errors import InputError
 from bnirl_ros.limits import Limits
 from bnirl_ros.maps import load_map

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from bnirl_ros.bags.reader import Topic
+from bnirl_ros.bags.topics import Topic
 from bnirl_ros.inference.summary import Parameter, Subgoal, Summary
 from bnirl_ros.views.pursuits import knows_pursuits, unexplained_share
 
