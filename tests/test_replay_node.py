@@ -16,8 +16,9 @@ from ros_support import NodeProcess, Peer, parameter_services, services
 
 from bnirl_ros.nodes.conversion import message_class  # isort: skip  # needs rclpy
 from bnirl_ros.nodes.process import separated  # isort: skip
-from bnirl_ros.nodes.replay_node import joint_offer  # isort: skip
-from bnirl_ros.nodes.replay_options import Options, Selection, parse  # isort: skip
+from bnirl_ros.nodes.qos import joint_offer  # isort: skip
+from bnirl_ros.nodes.replay_options import Options, parse  # isort: skip
+from bnirl_ros.nodes.selection import Selection  # isort: skip
 
 import importlib  # isort: skip
 

@@ -27,6 +27,15 @@ def message_class(type_name: str) -> Any:
         raise ImportError(f"{package} has no message {name}") from error
 
 
+def is_installed(type_name: str) -> bool:
+    """Whether there is an rclpy class of a message type."""
+    try:
+        message_class(type_name)
+    except (ImportError, ValueError):
+        return False
+    return True
+
+
 def to_ros(view: Message) -> Any:
     """The rclpy message that says what a view says."""
     message = message_class(view.TYPE)()

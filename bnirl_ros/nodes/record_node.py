@@ -16,14 +16,14 @@ from typing import Any
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 
 from bnirl_ros.bags.definitions import known_types
-from bnirl_ros.bags.qos import RELIABLE, QosProfile
 from bnirl_ros.bags.recording import RecordingBag
-from bnirl_ros.nodes.conversion import message_class
+from bnirl_ros.nodes.conversion import is_installed, message_class
 from bnirl_ros.nodes.process import run, separated
-from bnirl_ros.nodes.replay_options import Selection, add_selection, selection_of
+from bnirl_ros.nodes.qos import accepting, recorded_profile
+from bnirl_ros.nodes.selection import Selection, add_selection, selection_of
 
 _LOOK_PERIOD = 0.2  # [s] between two looks at who publishes what, and at whether to stop
 _OF_ROS = ("/rosout", "/parameter_events")  # are published by every node
@@ -94,7 +94,7 @@ class RecordNode(Node):
             self.get_logger().warning(f"{topic} is not recorded: {fault}")
             return
         else:
-            profiles = dict.fromkeys(map(_recorded_profile, offered))
+            profiles = dict.fromkeys(map(recorded_profile, offered))
             self._bag.add_topic(topic, types[0], *profiles)
             self.recorded[topic] = 0
             self.get_logger().info(f"records {topic}")
@@ -112,45 +112,13 @@ class RecordNode(Node):
         return record
 
 
-def accepting(offered: Sequence[QoSProfile]) -> QoSProfile:
-    """The most that all publishers of a topic offer; a subscriber asking for more hears nothing.
-
-    Whoever latches is heard from the beginning only by one who asks for it.
-    """
-    reliable = all(each.reliability is ReliabilityPolicy.RELIABLE for each in offered)
-    latched = all(each.durability is DurabilityPolicy.TRANSIENT_LOCAL for each in offered)
-    return QoSProfile(
-        depth=RELIABLE.depth,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
-
-
-def _recorded_profile(offered: QoSProfile) -> QosProfile:
-    """A publisher's QoS in the bag's words. DDS tells neither history nor depth of others."""
-    return QosProfile(
-        reliability="reliable"
-        if offered.reliability is ReliabilityPolicy.RELIABLE
-        else "best_effort",
-        durability="transient_local"
-        if offered.durability is DurabilityPolicy.TRANSIENT_LOCAL
-        else "volatile",
-        history="unknown"
-        if offered.history is HistoryPolicy.UNKNOWN
-        else offered.history.name.lower(),
-        depth=offered.depth,
-    )
-
-
 def _fault(types: Sequence[str]) -> str | None:
     """Why a topic of these types cannot be recorded."""
     if len(types) > 1:
         return f"is published with several types: {', '.join(types)}"
     if types[0] not in known_types():
         return f"type {types[0]} is unknown to bnirl_ros"
-    try:
-        message_class(types[0])
-    except (ImportError, ValueError):
+    if not is_installed(types[0]):
         return f"type {types[0]} isn't installed"
     return None
 

@@ -5,33 +5,26 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-from rclpy.duration import Duration
-from rclpy.exceptions import InvalidTopicNameException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
 from bnirl_ros.bags.player import Player, Source
-from bnirl_ros.bags.qos import LATCHED, QosProfile, read_overrides
 from bnirl_ros.bags.read_ahead import ReadAhead
 from bnirl_ros.bags.several import Bags, latched_at
-from bnirl_ros.bags.topics import RawMessage, Topic
+from bnirl_ros.bags.topics import RawMessage
 from bnirl_ros.errors import InputError
 from bnirl_ros.limits import Limits
-from bnirl_ros.maps import load_map
-from bnirl_ros.nodes.conversion import message_class, to_ros
+from bnirl_ros.nodes.conversion import message_class
 from bnirl_ros.nodes.parameters import Changeable, NodeParameter, declare
+from bnirl_ros.nodes.played_topics import PlayedTopics
 from bnirl_ros.nodes.process import run, separated
-from bnirl_ros.nodes.replay_options import BETWEEN_BAGS, Options, absolute, parse
+from bnirl_ros.nodes.replay_options import BETWEEN_BAGS, Options, parse
 from bnirl_ros.nodes.topics import NodeService
-from bnirl_ros.views.belief import map_message
 
 _TRIGGER = "std_srvs/srv/Trigger"
 SERVICES = (
@@ -74,15 +67,8 @@ PARAMETERS = (
 
 _CLOCK = "rosgraph_msgs/msg/Clock"
 _SECOND = 10**9  # [ns]
-_DEPTH = 1000  # of a reliable publisher at least that plays at a pace
-# Playing as fast as can be, so many messages of a topic are sent before all must be acknowledged.
-# It is also the depth of the publisher: when the history is full, Fast DDS asks subscribers for
-# acknowledgement (and has it in some 6 ms); otherwise it asks every three seconds only. And it is
-# small: what overflows the transport is sent again at 256 messages in three seconds.
-_ROUND = 50
 _LOOK_PERIOD = 0.05  # [s] between two looks at subscribers, services, and at whether to stop
 _STILL = 0.5  # [s] without a further subscriber, after which nobody is waited for any more
-_STUCK_AFTER = 10.0  # [s] without acknowledgement after which a subscriber is given up
 # Serving takes that long [s]; for less than that it is not worth while to serve, but to sleep.
 _SERVING = 0.001
 _SWITCHING = 0.0005  # [s] after which the thread that unpacks lets the one that sends go on
@@ -90,9 +76,6 @@ _PROGRESS_PERIOD = 0.2  # [s] between two lines of progress
 # A recorder gets what was latched long before when it has found who latches it: messages that come
 # so soon in a bag [ns] were there at its beginning.
 _LATCHED_BEFORE = 5 * _SECOND
-# Each of the nodes that publish fixed transforms latches one message, all on one topic.
-_TRANSFORMS = "tf2_msgs/msg/TFMessage"
-_TRANSFORMS_DEPTH = 100
 
 
 class ReplayNode(Node):
@@ -105,39 +88,19 @@ class ReplayNode(Node):
             InputError: an option doesn't fit the bags, or the map cannot be used.
         """
         super().__init__("replay_node")
-        self.sent: Counter[str] = Counter()
-        self.skipped: dict[str, str] = {}
         self.end = ""  # why it ended before the end of the recording
         self._bags = bags
         self._options = options
-        self._topic_publishers: dict[str, Any] = {}
-        self._types: dict[str, str] = {}  # of the topics; a name may have several in a recording
-        self._depths: dict[str, int] = {}  # of latched topics
-        self._rounds: dict[str, int] = {}  # messages after which all must be acknowledged
-        self._given_up: set[str] = set()  # topics that somebody doesn't acknowledge
         self._begin, self._length = _extent(bags)
         if options.offset > self._length:
             raise InputError(
                 f"--start-offset {options.offset:g}: the recording ends after "
                 f"{self._length:.1f} s; begin sooner"
             )
-        self._overrides = (
-            {absolute(topic): qos for topic, qos in read_overrides(options.qos_overrides).items()}
-            if options.qos_overrides
-            else {}
-        )
-        topics = bags.topics()
-        for topic in topics:
-            if not options.selection.has(topic.name):
-                self.skipped[topic.name] = "not wanted"
-            elif options.clock is not None and absolute(topic.name) == "/clock":
-                self.skipped[topic.name] = "--clock takes its place"
-            else:
-                self._announce(topic)
-        for fault in _unknown_names(options, topics):
-            self.get_logger().warning(fault)
-        if options.grid_map:
-            self._publish_map(options.grid_map)
+        self._clock_publisher: Any = None
+        if options.clock is not None:
+            self._clock_publisher = self.create_publisher(message_class(_CLOCK), "/clock", 10)
+        self._topics = PlayedTopics(self, bags.topics(), options, self._tell_time)
         (entry, *others) = PARAMETERS
         rate = options.rate if options.rate is not None else 1.0
         values = declare(self, (replace(entry, default=rate), *others))
@@ -156,9 +119,6 @@ class ReplayNode(Node):
         for service in SERVICES:
             answer: Callable[[], tuple[bool, str]] = getattr(self, f"_{service.name[2:]}")
             self.create_service(Trigger, service.name, _answering(answer))
-        self._clock_publisher: Any = None
-        if options.clock is not None:
-            self._clock_publisher = self.create_publisher(message_class(_CLOCK), "/clock", 10)
         self._clock_at = self._progress_at = self._served_at = 0.0
         self._told = sys.stderr.isatty()
         self._server = SingleThreadedExecutor()
@@ -173,7 +133,7 @@ class ReplayNode(Node):
         deadline = time.monotonic() + patience
         tell_at = time.monotonic() + 1.0
         wanted = "subscriber" if count == 1 else f"{count} subscribers"
-        while (missing := self._with_fewer_subscribers(count)) and not self._may_begin():
+        while (missing := self._topics.with_fewer_subscribers(count)) and not self._may_begin():
             if time.monotonic() > deadline:
                 self.get_logger().warning(
                     f"no {wanted} of {', '.join(missing)} after {patience:g} s; goes on without"
@@ -188,11 +148,11 @@ class ReplayNode(Node):
             self._serve(_LOOK_PERIOD)
         # A recorder beside the first subscriber is found a little later, and a short replay would
         # be over by then.
-        counts, still_until = self._subscriber_counts(), time.monotonic() + _STILL
+        counts, still_until = self._topics.subscriber_counts(), time.monotonic() + _STILL
         while time.monotonic() < still_until and not self._may_begin():
             self._serve(_LOOK_PERIOD)
-            if self._subscriber_counts() != counts:
-                counts, still_until = self._subscriber_counts(), time.monotonic() + _STILL
+            if self._topics.subscriber_counts() != counts:
+                counts, still_until = self._topics.subscriber_counts(), time.monotonic() + _STILL
         deadline = time.monotonic() + self._options.delay
         while time.monotonic() < deadline and not self._may_begin():
             self._serve(min(_LOOK_PERIOD, max(0.0, deadline - time.monotonic())))
@@ -219,17 +179,16 @@ class ReplayNode(Node):
                 time.sleep(wait)
             self._tell_time()
             while (message := player.take()) is not None:
-                self._send(message)
+                self._topics.send(message, fast=player.rate is None)
                 if player.rate is None:
                     break
         if self._stopped:
             self.end = f"stopped at {self._seconds():.1f} s of {self._length:.1f} s"
             return
-        for topic in self._topic_publishers:
-            self._wait_until_acknowledged(topic)
+        self._topics.wait_until_acknowledged()
         passed = time.monotonic() - begun
         self._clear_progress()
-        self.get_logger().info(f"played {self.sent.total()} messages in {passed:.3f} s")
+        self.get_logger().info(f"played {self._topics.sent.total()} messages in {passed:.3f} s")
 
     def close(self) -> None:
         """Let go of everything."""
@@ -240,10 +199,7 @@ class ReplayNode(Node):
 
     def report(self) -> str:
         """A line on what was sent, and what was not and why."""
-        parts = [f"{topic} {count}" for topic, count in sorted(self.sent.items())]
-        parts += [f"{topic} not sent ({why})" for topic, why in sorted(self.skipped.items())]
-        end = f"; {self.end}" if self.end else ""
-        return f"sent {self.sent.total()} messages: {', '.join(parts) or 'none'}{end}"
+        return self._topics.report() + (f"; {self.end}" if self.end else "")
 
     # Services: whether it could be done, and what there is to say.
 
@@ -273,7 +229,7 @@ class ReplayNode(Node):
             return False, "is not paused; call ~/pause first"
         sent = 0
         while sent < count and (message := self._player.play_next()) is not None:
-            self._send(message)
+            self._topics.send(message, fast=self._player.rate is None)
             sent += 1
         return sent > 0, f"sent {sent} messages; {self._place()}"
 
@@ -305,58 +261,9 @@ class ReplayNode(Node):
     def _seconds(self) -> float:
         return (self._player.position - self._begin) / _SECOND
 
-    # Publishing
-
-    def _announce(self, topic: Topic) -> None:
-        if topic.name in self._topic_publishers:
-            self._skip(
-                replace(topic, name=f"{topic.name} ({topic.type_name})"), "its name is taken"
-            )
-            return
-        if topic.encoding != "cdr":
-            self._skip(topic, f"encoded as {topic.encoding or 'nothing'}, not cdr")
-            return
-        try:
-            kind = message_class(topic.type_name)
-        except (ImportError, ValueError):
-            self._skip(topic, f"type {topic.type_name or 'unknown'} isn't installed")
-            return
-        recorded = joint_offer(topic.qos)
-        given = self._overrides.get(absolute(topic.name), {})
-        qos = replace(recorded, **given)
-        if qos.durability == LATCHED.durability:
-            if topic.type_name == _TRANSFORMS and "depth" not in given:
-                qos = replace(qos, depth=_TRANSFORMS_DEPTH)
-            self._depths[topic.name] = min(max(1, qos.depth), _TRANSFORMS_DEPTH)
-        elif qos.reliability != "best_effort" and "depth" not in given:
-            depth = _ROUND if self._options.rate is None else max(qos.depth, _DEPTH)
-            qos = replace(qos, depth=depth)
-        name = dict(self._options.remaps).get(absolute(topic.name), topic.name)
-        try:
-            publisher = self.create_publisher(kind, name, qos_profile(qos))
-        except InvalidTopicNameException as error:
-            raise InputError(f"{name}: is no name for a topic; choose another one") from error
-        self._topic_publishers[topic.name] = publisher
-        self._types[topic.name] = topic.type_name
-        self._rounds[topic.name] = min(max(1, qos.depth), _ROUND)
-
-    def _skip(self, topic: Topic, why: str) -> None:
-        self.skipped[topic.name] = why
-        self.get_logger().warning(f"{topic.name} is not sent: {why}")
-
-    def _publish_map(self, path: Path) -> None:
-        """Publish a map file on /map, latched."""
-        if "/map" in self._topic_publishers:
-            raise InputError(f"{path}: the bag has a topic /map already; leave out --map")
-        view = map_message(load_map(path), time.time_ns())
-        self._announce(Topic("/map", view.TYPE, 1, (LATCHED,)))
-        self._depths.pop("/map")  # it is none of the bag's
-        self._topic_publishers["/map"].publish(to_ros(view))
-        self.sent["/map"] += 1
-
     def _source(self) -> Source:
         """The messages of the topics that are sent."""
-        wanted = frozenset(self._topic_publishers)
+        wanted = self._topics.names
         begin = self._begin + round(self._options.offset * _SECOND)
         end = self._begin + math.ceil(self._length * _SECOND)
         if self._options.duration is not None:
@@ -368,32 +275,9 @@ class ReplayNode(Node):
             return ReadAhead(self._bags.messages(wanted, since, until))
 
         def latched(at: int) -> list[RawMessage]:
-            return latched_at(self._bags, self._depths, at, early)
+            return latched_at(self._bags, self._topics.latched, at, early)
 
         return Source(begin, messages, latched)
-
-    def _send(self, message: RawMessage) -> None:
-        topic = message.topic
-        if message.type_name != self._types[topic] or message.encoding != "cdr":
-            return
-        self._topic_publishers[topic].publish(message.data)
-        self.sent[topic] += 1
-        if self._player.rate is None and self.sent[topic] % self._rounds[topic] == 0:
-            self._wait_until_acknowledged(topic)
-
-    def _wait_until_acknowledged(self, topic: str) -> None:
-        """Wait until every reliable subscriber has what was sent, unless one doesn't answer."""
-        publisher = self._topic_publishers[topic]
-        deadline = time.monotonic() + _STUCK_AFTER
-        while topic not in self._given_up:
-            if publisher.wait_for_all_acked(Duration(seconds=_LOOK_PERIOD)):
-                return
-            self._tell_time()
-            if time.monotonic() > deadline:
-                self._given_up.add(topic)
-                self.get_logger().warning(
-                    f"a subscriber of {topic} doesn't acknowledge; it is not waited for any more"
-                )
 
     # Whatever else there is to do
 
@@ -412,7 +296,7 @@ class ReplayNode(Node):
             self._publish_clock()
         if self._told and now >= self._progress_at:
             self._progress_at = now + _PROGRESS_PERIOD
-            line = f"{self._place()}, {self.sent.total()} messages"
+            line = f"{self._place()}, {self._topics.sent.total()} messages"
             print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
 
     def _clear_progress(self) -> None:
@@ -427,41 +311,6 @@ class ReplayNode(Node):
     def _may_begin(self) -> bool:
         return self._go_on or self._stopped
 
-    def _subscriber_counts(self) -> dict[str, int]:
-        return {
-            topic: publisher.get_subscription_count()
-            for topic, publisher in self._topic_publishers.items()
-        }
-
-    def _with_fewer_subscribers(self, wanted: int) -> list[str]:
-        return [topic for topic, count in self._subscriber_counts().items() if count < wanted]
-
-
-def qos_profile(recorded: QosProfile) -> QoSProfile:
-    """rclpy's form of a recorded profile; what it leaves open is as ROS does by default."""
-    return QoSProfile(
-        depth=recorded.depth or 10,
-        history=HistoryPolicy.KEEP_ALL
-        if recorded.history == "keep_all"
-        else HistoryPolicy.KEEP_LAST,
-        reliability=ReliabilityPolicy.BEST_EFFORT
-        if recorded.reliability == "best_effort"
-        else ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL
-        if recorded.durability == "transient_local"
-        else DurabilityPolicy.VOLATILE,
-    )
-
-
-def joint_offer(recorded: Sequence[QosProfile]) -> QosProfile:
-    """What one publisher offers in place of several, so that all who heard them hear it."""
-    if not recorded:
-        return QosProfile()
-    first, *others = sorted(recorded, key=lambda each: each.reliability == "best_effort")
-    if any(each.durability != LATCHED.durability for each in others):
-        return replace(first, durability="volatile")
-    return first
-
 
 def _extent(bags: Bags) -> tuple[int, float]:
     """When the first message was recorded [ns], and how long the recording is [s]."""
@@ -469,19 +318,6 @@ def _extent(bags: Bags) -> tuple[int, float]:
     if first is None or bags.span is None:
         return 0, 0.0
     return first.log_time, max(0, bags.span[1] - first.log_time) / _SECOND
-
-
-def _unknown_names(options: Options, topics: Sequence[Topic]) -> list[str]:
-    """What is said of topics that no bag has; if none of the wanted ones is there, an error."""
-    names = {absolute(topic.name) for topic in topics}
-    selection = options.selection
-    given = {*(selection.topics or ()), *selection.exclude, *dict(options.remaps)}
-    if (selection.topics or selection.regex) and not any(map(selection.has, names)):
-        raise InputError(
-            f"{options.bags[0]}: has none of the topics that are wanted; it has "
-            f"{', '.join(sorted(names)) or 'none'}"
-        )
-    return [f"there is no {name} in the recording" for name in sorted(given - names)]
 
 
 def _answering(answer: Callable[[], tuple[bool, str]]) -> Callable[..., Any]:

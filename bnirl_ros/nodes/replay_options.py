@@ -3,45 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from bnirl_ros.bags.topics import absolute
 from bnirl_ros.limits import above_zero, one_or_more, zero_or_more
+from bnirl_ros.nodes.selection import Selection, add_selection, selection_of
 
 CLOCK_RATE = 40.0
 """How often /clock is published unless it is said [Hz]."""
 
 BETWEEN_BAGS = 5.0
 """To which a silence is cut where there are several bags, unless it is said [s]."""
-
-
-@dataclass(frozen=True)
-class Selection:
-    """Which topics are wanted; all where nothing is said.
-
-    Attributes:
-        topics: names of some.
-        regex: the wanted ones' whole names match it, or are among `topics`.
-        exclude: names of those that are not wanted, whatever else is said.
-        exclude_regex: as `exclude`, for whole names that match it.
-    """
-
-    topics: tuple[str, ...] | None = None
-    regex: re.Pattern[str] | None = None
-    exclude: tuple[str, ...] = ()
-    exclude_regex: re.Pattern[str] | None = None
-
-    def has(self, topic: str) -> bool:
-        """Whether a topic is wanted."""
-        name = absolute(topic)
-        if name in self.exclude or (self.exclude_regex and self.exclude_regex.fullmatch(name)):
-            return False
-        if self.topics is None and self.regex is None:
-            return True
-        named = self.topics is not None and name in self.topics
-        return named or bool(self.regex and self.regex.fullmatch(name))
 
 
 @dataclass(frozen=True)
@@ -84,11 +58,6 @@ class Options:
     clock: float | None = None
 
 
-def absolute(topic: str) -> str:
-    """A topic's name with its leading slash, which is often left out."""
-    return topic if topic.startswith("/") else f"/{topic}"
-
-
 def parse(arguments: Sequence[str], name: str = "replay_node") -> Options:
     """The options on a command line without ROS arguments; wrong ones end with status 2."""
     given = _parser(name).parse_args(arguments)
@@ -108,31 +77,6 @@ def parse(arguments: Sequence[str], name: str = "replay_node") -> Options:
         remaps=tuple(given.remap),
         qos_overrides=given.qos_profile_overrides_path,
         clock=given.clock,
-    )
-
-
-def selection_of(given: argparse.Namespace, topics: Sequence[str] | None = None) -> Selection:
-    """What the options of `add_selection` say, and the names of wanted topics."""
-    return Selection(
-        None if topics is None else tuple(map(absolute, topics)),
-        given.regex,
-        tuple(map(absolute, given.exclude_topics)),
-        given.exclude_regex,
-    )
-
-
-def add_selection(parser: argparse._ActionsContainer) -> None:
-    """Options by which topics are chosen."""
-    parser.add_argument("-e", "--regex", type=_pattern, help="only those whose whole name matches")
-    parser.add_argument(
-        "--exclude-topics", nargs="+", default=(), metavar="TOPIC", help="leave these out"
-    )
-    parser.add_argument(
-        "-x",
-        "--exclude-regex",
-        type=_pattern,
-        metavar="REGEX",
-        help="leave those out whose whole name matches",
     )
 
 
@@ -240,13 +184,6 @@ def _add_topics(parser: argparse._ArgumentGroup) -> None:
         "is as recorded",
     )
     parser.add_argument("--map", type=Path, help="map file to publish on /map for a bag without")
-
-
-def _pattern(text: str) -> re.Pattern[str]:
-    try:
-        return re.compile(text)
-    except re.error as error:
-        raise argparse.ArgumentTypeError(f"{text!r} is no regular expression: {error}") from error
 
 
 def _remap(text: str) -> tuple[str, str]:
