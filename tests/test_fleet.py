@@ -253,6 +253,7 @@ def test_names_are_those_of_the_files_and_none_twice(tmp_path: Path) -> None:
     ("arguments", "words"),
     [
         (["monday", "./monday"], "monday: is named twice; name each DEMO once"),
+        (["monday", "-"], "-: workers have no standard input; infer from it alone"),
         (["monday", "walk.csv"], "walk.csv: a CSV file tells no map; give one with --map"),
         (["monday", "--each", "--jobs", "0"], "must be at least 1, not 0"),
         (["monday", "--jobs", "2", "--scheduler", "tcp://x:1"], "--jobs: is for this machine"),

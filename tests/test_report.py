@@ -27,7 +27,7 @@ from bnirl_ros.inference.summary import Summary, summarise
 from bnirl_ros.maps import FeatureMap, GridMap
 from bnirl_ros.mdp.actions import ACTION_NAMES
 from bnirl_ros.views.colours import colour_of
-from bnirl_ros.views.report import report_page
+from bnirl_ros.views.report import report_page, title_of
 from browser_support import chromium, complaints
 
 pytestmark = pytest.mark.timeout(180)
@@ -217,6 +217,19 @@ def test_names_from_bags_stay_text(hostile: Told) -> None:
 def test_a_name_that_is_no_utf_8_is_written_all_the_same(loop: Told) -> None:
     name = os.fsdecode(b"drive \xff.mcap")
     assert "drive ?.mcap" in loop.page(title=name).encode("utf-8").decode("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("paths", "title"),
+    [
+        (["logs/monday"], "monday"),
+        (["-"], "standard input"),
+        (["b.mcap", "a.csv", "c"], "b.mcap, a.csv, c"),
+        (["a", "b", "c", "d"], "4 demonstrations"),
+    ],
+)
+def test_a_title_names_few_and_counts_many(paths: list[str], title: str) -> None:
+    assert title_of(list(map(Path, paths))) == title
 
 
 def test_a_page_of_nothing_but_slips(loop: Told) -> None:

@@ -21,6 +21,9 @@ FILE_LIMIT = 2**30
 FILE_RATIO = 1000
 """How much smaller a file beyond `FILE_LIMIT` may be packed than unpacked."""
 
+STANDARD_INPUT = Path("-")
+"""Stands for what is piped into the command."""
+
 ENDINGS = (".mcap", ".mcap.zstd", ".mcap.zst")
 """Of the names of the files that may be of a bag."""
 
@@ -73,7 +76,7 @@ def source_of(path: Path) -> Source:
 def is_pipe(path: Path) -> bool:
     """Whether a path stands for bytes that can be read once only: `-`, or a pipe by its name."""
     try:
-        return str(path) == "-" or stat.S_ISFIFO(path.stat().st_mode)
+        return path == STANDARD_INPUT or stat.S_ISFIFO(path.stat().st_mode)
     except OSError:
         return False
 
@@ -85,7 +88,7 @@ def is_packed(path: Path) -> bool:
 
 def _drained(path: Path) -> IO[bytes]:
     """What comes out of a pipe: read once, when it is asked for first."""
-    if str(path) == "-":
+    if path == STANDARD_INPUT:
         return _drained_once(None, os.fstat(sys.stdin.fileno()).st_ino)
     return _drained_once(path, path.stat().st_ino)
 

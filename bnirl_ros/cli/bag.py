@@ -57,7 +57,8 @@ def _info(options: argparse.Namespace) -> int:
         for warning in inspection.warnings:
             warn(warning)
         if inspection.damage:
-            warn(f"{inspection.damage}; save them with `bnirl bag repair {path} --out FOLDER`")
+            remedy = f"; save them with `bnirl bag repair {path} --out FOLDER`"
+            warn(inspection.damage + remedy * bool(inspection.messages))
             status = 1
     return status
 

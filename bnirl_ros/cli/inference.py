@@ -22,7 +22,7 @@ _Table = TypeVar("_Table", bound=Any)
 """A class of settings."""
 
 
-DEMONSTRATION = "rosbag2 folder, .mcap file or .csv"
+DEMONSTRATION = "rosbag2 folder, .mcap file, also compressed, .csv, or - for a bag from a pipe"
 """What may be inferred from."""
 
 

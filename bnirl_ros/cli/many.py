@@ -55,6 +55,7 @@ def infer_many(
     options: argparse.Namespace, settings: Settings, remappings: Mapping[str, str]
 ) -> int:
     """`bnirl infer` on several demonstrations; returns the exit status."""
+    from bnirl_ros.bags.sources import STANDARD_INPUT
     from bnirl_ros.fleet.account import account_table, write_account
     from bnirl_ros.maps import load_features
     from bnirl_ros.views.results import check_writable
@@ -64,6 +65,8 @@ def infer_many(
     for number, path in enumerate(resolved):
         if path in resolved[:number]:
             options.command.error(f"{paths[number]}: is named twice; name each DEMO once")
+    if STANDARD_INPUT in paths:
+        options.command.error("-: workers have no standard input; infer from it alone")
     if options.jobs and options.scheduler:
         options.command.error("--jobs: is for this machine; leave it out with --scheduler")
     reading = reading_of(options, settings, remappings, map_of(options, paths))

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bnirl_ros import __version__
+from bnirl_ros.bags.sources import STANDARD_INPUT
 from bnirl_ros.inference.diagnostics import effective_sample_size, rhat
 from bnirl_ros.inference.posterior import Posterior
 from bnirl_ros.inference.settings import Settings
@@ -53,7 +54,9 @@ def title_of(paths: Sequence[Path]) -> str:
     """The title for a page of what was inferred from these files together."""
     if len(paths) > _MOST_NAMES:
         return f"{len(paths)} demonstrations"
-    return ", ".join(path.resolve().name for path in paths)
+    return ", ".join(
+        "standard input" if path == STANDARD_INPUT else path.resolve().name for path in paths
+    )
 
 
 def report_page(posterior: Posterior, summary: Summary, grid_map: GridMap, title: str) -> str:
