@@ -81,7 +81,11 @@ def test_several_bags_are_as_one_of_all_their_episodes(
 ) -> None:
     whole = write_bag(tmp_path / "whole", [map_of_grid(), *walk(3)])
     assert bnirl("infer", whole, "--out", tmp_path / "one", *QUICK).status == 0
-    end = bnirl("infer", *bags, "--report", "--out", tmp_path / "pooled", *QUICK)
+    logs = tmp_path / "logs"  # a folder of bags is all bags in it
+    logs.mkdir()
+    for bag in bags:
+        bag.rename(logs / bag.name)
+    end = bnirl("infer", logs, "--report", "--out", tmp_path / "pooled", *QUICK)
     assert (end.status, end.err) == (0, "")
     assert contents(tmp_path / "pooled") == contents(tmp_path / "one")
     written = sorted(path.name for path in (tmp_path / "pooled").iterdir())

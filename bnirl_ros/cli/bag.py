@@ -25,7 +25,9 @@ def add(commands: Any) -> None:
         "Read bags from end to end, damaged ones as far as they go, and tell what is in them, "
         "what `bnirl infer` would take of it, and what is missing."
     )
-    info.add_argument("bags", nargs="+", metavar="BAG", type=Path, help=_BAG_HELP)
+    info.add_argument(
+        "bags", nargs="+", metavar="BAG", type=Path, help=f"{_BAG_HELP}, or folder of bags"
+    )
     info.set_defaults(run=_info, command=info)
 
     repair = actions.add_parser("repair", help="write a healthy bag from a damaged one")
@@ -44,9 +46,10 @@ def add(commands: Any) -> None:
 def _info(options: argparse.Namespace) -> int:
     """`bnirl bag info`: a bag that cannot be read does not stop the others."""
     from bnirl_ros.bags.inspection import inspect
+    from bnirl_ros.bags.several import bags_in
 
     status = 0
-    for number, path in enumerate(options.bags):
+    for number, path in enumerate(bag for given in options.bags for bag in bags_in(given)):
         try:
             inspection = inspect(path)
         except InputError as refusal:

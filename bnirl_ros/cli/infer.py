@@ -27,7 +27,7 @@ def add(commands: Any) -> None:
         metavar="DEMO",
         nargs="+",
         type=Path,
-        help=f"{DEMONSTRATION}; several are pooled into one posterior",
+        help=f"{DEMONSTRATION}; or a folder of bags; several are pooled into one posterior",
     )
     add_inference(parser)
     parser.add_argument(
@@ -41,6 +41,10 @@ def _infer(options: argparse.Namespace) -> int:
     """`bnirl infer`: from files to the three result files and a table."""
     settings = settings_of(options.command, options)
     remappings = remappings_of(options.command, options.remap)
+
+    from bnirl_ros.bags.several import bags_in
+
+    options.demonstrations = [bag for path in options.demonstrations for bag in bags_in(path)]
     if len(options.demonstrations) > 1 or options.each or options.scheduler:
         return infer_many(options, settings, remappings)
 
