@@ -71,6 +71,8 @@ _LOOK_PERIOD = 0.05  # [s] between two looks at subscribers, services, and at wh
 _STILL = 0.5  # [s] without a further subscriber, after which nobody is waited for any more
 # Serving takes that long [s]; for less than that it is not worth while to serve, but to sleep.
 _SERVING = 0.001
+# [s] for who asked to stop to take the answer, which is gone with the process that gave it.
+_ANSWERING = 0.5
 _SWITCHING = 0.0005  # [s] after which the thread that unpacks lets the one that sends go on
 _PROGRESS_PERIOD = 0.2  # [s] between two lines of progress
 # A recorder gets what was latched long before when it has found who latches it: messages that come
@@ -184,6 +186,7 @@ class ReplayNode(Node):
                     break
         if self._stopped:
             self.end = f"stopped at {self._seconds():.1f} s of {self._length:.1f} s"
+            time.sleep(_ANSWERING)
             return
         self._topics.wait_until_acknowledged()
         passed = time.monotonic() - begun
