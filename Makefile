@@ -67,6 +67,7 @@ benchmark: venv  ## Time the main job and its parts, load the subgoal node, and 
 	$(BIN)/python benchmarks/main_job.py
 	$(BIN)/python benchmarks/load.py
 	$(BIN)/python benchmarks/replay.py
+	$(BIN)/python benchmarks/large_bag.py
 
 campaigns: venv  ## Damage bags in thousands of ways, and see what is read of them
 	$(BIN)/python -m bnirl_ros.experiments.damage $(CAMPAIGN_ARGS) bags $(wildcard $(BAGS))
