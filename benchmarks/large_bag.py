@@ -56,7 +56,7 @@ def write(path: Path, megabytes: int, layout: str) -> int:
             log_time = (number + 1) * 10**9 // HZ
             data = blocks[start : start + MESSAGE]
             writer.add_message(channel, log_time, data, log_time)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
     if whole:
         packed = path.with_name(f"{path.name}.zstd")
         with path.open("rb") as stream, packed.open("wb") as out:
@@ -98,7 +98,7 @@ def main() -> int:
             with multiprocessing.get_context("spawn").Pool(1) as writer:
                 # A process begins with the memory of its parent, which must be little.
                 count = writer.apply(write, (path, size, layout))
-            commands = {f"bag info, {layout}": ("bag", "info", folder)}
+            commands: dict[str, tuple[str, ...]] = {f"bag info, {layout}": ("bag", "info", folder)}
             if layout.startswith("chunks of 64"):
                 commands[f"replay, {layout}"] = ("replay", folder, "--fast", "--wait", "1")
             for what, arguments in commands.items():
