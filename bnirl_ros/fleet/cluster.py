@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import socket
 from collections.abc import Sequence
 from pathlib import Path
@@ -37,6 +38,8 @@ def on_cluster(work: Work[Value], paths: Sequence[Path], address: str) -> Answer
             "--scheduler: needs dask.distributed, which is not installed; "
             "pip install 'bnirl_ros[dask]'"
         ) from None
+    # That a worker's results are lost with it and made again is no news for who waits for them.
+    logging.getLogger("distributed.client").setLevel(logging.ERROR)
     try:
         client = Client(address, timeout=_TIMEOUT)
     except (OSError, ValueError) as error:
