@@ -44,7 +44,7 @@ def in_processes(work: Work[Value], paths: Sequence[Path], processes: int) -> An
             yield number, answer
         else:
             dead.append(number)
-    for number, answer in _in_processes(work, paths, dead, 1):
+    for number, answer in _in_processes(work, paths, sorted(dead), 1):
         yield number, answer or Answer(error=f"{paths[number]}: {_DIED_TWICE}")
 
 
