@@ -10,6 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from bnirl_ros.mdp.process import first_passage_by_sweeps
+
 
 @dataclass(frozen=True, eq=False)
 class FiniteMDP:
@@ -124,6 +126,12 @@ class FiniteMDP:
     ) -> None:
         """See `bnirl_ros.mdp.process.MarkovDecisionProcess.solve`."""
         _solve(*self._motion, self.discount, rewards, goals, tolerance, values)
+
+    def first_passage(
+        self, goals: npt.NDArray[np.int64], tolerance: float
+    ) -> npt.NDArray[np.float64]:
+        """See `bnirl_ros.mdp.process.MarkovDecisionProcess.first_passage`."""
+        return first_passage_by_sweeps(self, goals, tolerance)
 
     def expected_values(
         self, values: npt.NDArray[np.float64], states: npt.NDArray[np.int64]

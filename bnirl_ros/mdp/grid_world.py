@@ -11,6 +11,8 @@ import numpy.typing as npt
 from numba import njit
 
 from bnirl_ros.mdp.actions import ACTION_SETS, STEPS
+from bnirl_ros.mdp.first_passage import DIAGONAL, STRAIGHT, first_passage_values
+from bnirl_ros.mdp.process import first_passage_by_sweeps
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +153,30 @@ class GridWorld:
     ) -> None:
         """See `bnirl_ros.mdp.process.MarkovDecisionProcess.solve`."""
         _solve(*self._motion, self.discount, rewards, goals, tolerance, values)
+
+    def first_passage(
+        self, goals: npt.NDArray[np.int64], tolerance: float
+    ) -> npt.NDArray[np.float64]:
+        """See `bnirl_ros.mdp.process.MarkovDecisionProcess.first_passage`.
+
+        The bound is on the relative error, unless an action leads elsewhere more often than where
+        it is meant to.
+        """
+        spread = (1.0 - self.success) / (len(self.offsets) - 1)
+        if self.success <= spread or self.discount == 0.0:
+            return first_passage_by_sweeps(self, goals, tolerance)
+        is_diagonal = STEPS[self.actions].all(axis=1)
+        values: npt.NDArray[np.float64] = first_passage_values(
+            self.open_moves.reshape(-1),
+            tuple(self.offsets.tolist()),
+            tuple(np.where(is_diagonal, DIAGONAL, STRAIGHT).tolist()),
+            self.success,
+            spread,
+            self.discount,
+            goals,
+            tolerance,
+        )
+        return values
 
     def expected_values(
         self, values: npt.NDArray[np.float64], states: npt.NDArray[np.int64]

@@ -44,6 +44,19 @@ class MarkovDecisionProcess(Protocol):
             values: where to begin, and the result.
         """
 
+    def first_passage(
+        self, goals: npt.NDArray[np.int64], tolerance: float
+    ) -> npt.NDArray[np.float64]:
+        """(S, L) discounted first-passage values of the goals (L,).
+
+        h(g) = 1 and h(s) = gamma max_a E[h(s')]: the mean of gamma ** steps on the best way.
+
+        Args:
+            goals: state numbers.
+            tolerance: bound on the error.
+        """
+        ...
+
     def expected_values(
         self, values: npt.NDArray[np.float64], states: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.float64]:
@@ -57,6 +70,16 @@ class MarkovDecisionProcess(Protocol):
     def parts_of(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]: ...
 
     def places_of(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]: ...
+
+
+def first_passage_by_sweeps(
+    mdp: MarkovDecisionProcess, goals: npt.NDArray[np.int64], tolerance: float
+) -> npt.NDArray[np.float64]:
+    """First-passage values (S, L) of any MDP, with a bound on the absolute error."""
+    values = np.zeros((mdp.state_count, len(goals)))
+    values[goals, np.arange(len(goals))] = 1.0
+    mdp.solve(np.zeros((1, len(goals))), goals, tolerance, values)
+    return values
 
 
 def checked_states(

@@ -25,7 +25,7 @@ from bnirl_ros.mdp.goals import Goals
 from bnirl_ros.mdp.process import MarkovDecisionProcess
 from bnirl_ros.model.likelihood import action_columns, delays, value_losses
 
-_VALUE_TOLERANCE = 1e-13  # delays are ratios of values, which fall off with the distance
+_VALUE_TOLERANCE = 1e-8  # far below what the likelihood can tell, also of ratios far away
 
 
 class Prior(NamedTuple):
