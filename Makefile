@@ -63,11 +63,13 @@ bags: venv  ## Make the bags in bags/ again
 reference: venv  ## Write docs/reference.md, the topics and parameters of the nodes
 	$(BIN)/python -m bnirl_ros.nodes.reference docs/reference.md
 
-benchmark: venv  ## Time the main job and its parts, load the subgoal node, and replay
+benchmark: venv  ## Time the main job and its parts, the node under load, replay, and goal values
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[benchmark]'
 	$(BIN)/python benchmarks/main_job.py
 	$(BIN)/python benchmarks/load.py
 	$(BIN)/python benchmarks/replay.py
 	$(BIN)/python benchmarks/large_bag.py
+	$(BIN)/python benchmarks/goal_values.py
 
 campaigns: venv  ## Damage bags in thousands of ways, and see what is read of them
 	$(BIN)/python -m bnirl_ros.experiments.damage $(CAMPAIGN_ARGS) bags $(wildcard $(BAGS))

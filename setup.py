@@ -27,6 +27,10 @@ REQUIREMENTS = [
 ]
 
 EXTRAS = {
+    # The fastest of the others who solve such MDPs, to compare with.
+    "benchmark": [
+        "quantecon>=0.7",
+    ],
     # A cluster to infer on, of which `bnirl infer --scheduler` is a client.
     "dask": [
         "distributed>=2024.1",
