@@ -33,7 +33,7 @@ _FINEST = 2e-15  # changes by this factor are rounding
 _LEAST = 1e-280  # smaller values are as good as none
 _STEADIEST = 0.3  # the least 1 - D / h_old that is divided by
 _NO_NAN = {"nnan", "ninf", "nsz"}  # nothing that changes a value: the order of sums is kept
-_PATIENCE = 20  # sweeps without progress after which all are plain ones
+_PATIENCE = 20  # sweeps in which no further cell settles, after which all are plain ones
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -169,17 +169,20 @@ def _relax(  # type: ignore[no-untyped-def]
     open_moves, offsets, chosen, other, discount, order, behind, tolerance, value
 ):
     """Bring `value` (S,) to h, within h times `tolerance`."""
-    least_change, stuck = math.inf, 0
+    wanted, fewest, stuck = tolerance, order.shape[0] + 1, 0
     while True:
         if stuck < _PATIENCE:
             _rescaling_sweep(open_moves, offsets, chosen, other, discount, order, behind, value)
-        change, least = _plain_sweep(open_moves, offsets, chosen, other, order, value)
-        if change <= _FINEST or change * _amplification(least, discount) <= tolerance:
+        change, least, unsettled = _plain_sweep(
+            open_moves, offsets, chosen, other, order, wanted, value
+        )
+        wanted = max(_FINEST, tolerance / _amplification(least, discount))
+        if change <= wanted:
             return
-        if change >= 0.5 * least_change:
+        if unsettled < fewest:
+            fewest, stuck = unsettled, 0 if stuck < _PATIENCE else stuck
+        else:
             stuck += 1
-        elif stuck < _PATIENCE:
-            least_change, stuck = change, 0
 
 
 @njit(nogil=True, cache=True)
@@ -243,10 +246,16 @@ def _rescaling_sweep(  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath=_NO_NAN)
-def _plain_sweep(open_moves, offsets, chosen, other, order, value):  # type: ignore[no-untyped-def]
-    """A sweep of Gauss and Seidel; returns the largest relative change, and the least value."""
+def _plain_sweep(  # type: ignore[no-untyped-def]
+    open_moves, offsets, chosen, other, order, wanted, value
+):
+    """A sweep of Gauss and Seidel.
+
+    Returns:
+        The largest relative change, the least value, and how many changed by more than `wanted`.
+    """
     all_open = (1 << len(offsets)) - 1
-    change, least = 0.0, 1.0
+    change, least, unsettled = 0.0, 1.0, 0
     for number in range(1, order.shape[0]):
         state = order[number]
         bits = np.int64(open_moves[state])
@@ -267,6 +276,7 @@ def _plain_sweep(open_moves, offsets, chosen, other, order, value):  # type: ign
         difference = abs(new - old)
         if difference > change * new and new > _LEAST:
             change = difference / new
+        unsettled += difference > wanted * new
         least = min(least, new)
         value[state] = new
-    return change, least
+    return change, least, unsettled

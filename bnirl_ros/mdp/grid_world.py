@@ -162,15 +162,15 @@ class GridWorld:
         The bound is on the relative error, unless an action leads elsewhere more often than where
         it is meant to.
         """
-        spread = (1.0 - self.success) / (len(self.offsets) - 1)
-        if self.success <= spread or self.discount == 0.0:
+        open_moves, offsets, success, spread = self._motion
+        if success <= spread or self.discount == 0.0:
             return first_passage_by_sweeps(self, goals, tolerance)
         is_diagonal = STEPS[self.actions].all(axis=1)
         values: npt.NDArray[np.float64] = first_passage_values(
-            self.open_moves.reshape(-1),
-            tuple(self.offsets.tolist()),
+            open_moves.reshape(-1),
+            tuple(offsets.tolist()),
             tuple(np.where(is_diagonal, DIAGONAL, STRAIGHT).tolist()),
-            self.success,
+            success,
             spread,
             self.discount,
             goals,
