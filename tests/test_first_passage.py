@@ -116,3 +116,71 @@ def test_an_action_that_mostly_leads_elsewhere_is_no_obstacle() -> None:
     world = GridWorld(np.ones((6, 6), dtype=bool), success=0.05, discount=0.8)
     found = world.first_passage(np.array([14]), 1e-12)
     np.testing.assert_allclose(found[:, 0], exact(world, 14), rtol=0, atol=1e-9)
+
+
+def corner_of(world: GridWorld, side: int) -> npt.NDArray[np.int64]:
+    """The states of a square at the lower left that can be in."""
+    states = np.flatnonzero(world.free)
+    return states[(world.cells_of(states) < side).all(axis=1)]
+
+
+@pytest.mark.parametrize("moves", [4, 8])
+@pytest.mark.parametrize("success", [0.5, 0.7, 1.0])
+def test_what_is_asked_in_a_corner_of_a_large_map_is_solved_there(
+    moves: int, success: float
+) -> None:
+    free = np.random.default_rng(3).random((400, 400)) > 0.1
+    free[:20, :20] = True
+    world = GridWorld(free, moves=moves, success=success)
+    asked = corner_of(world, 20)
+    goals = asked[[0, 150, -1]]
+    everywhere = world.first_passage(goals, 1e-12)
+    found = world.first_passage(goals, 1e-6, states=asked)
+    around = np.unique(world.outcomes()[asked])
+    np.testing.assert_allclose(found[around], everywhere[around], rtol=1e-6)
+    assert np.count_nonzero(found) < 0.1 * np.count_nonzero(everywhere)
+
+
+def test_a_detour_beyond_the_margin_is_found_where_it_is_the_better_way() -> None:
+    """A short way through a maze of pillars, on which the demonstrator is often held up, and a
+    long one around it: the part that is solved has to grow until it has the long one in it."""
+    free = np.ones((260, 260), dtype=bool)
+    free[1:60:2, 10:40:2] = False  # every move among them that fails may be blocked
+    world = GridWorld(free, success=0.35, discount=0.999)
+    goals = np.array([30 * 260 + 2])
+    asked = np.array([30 * 260 + 48])
+    everywhere = world.first_passage(goals, 1e-12)[asked]
+    np.testing.assert_allclose(
+        world.first_passage(goals, 1e-9, states=asked)[asked], everywhere, rtol=1e-9
+    )
+
+
+def test_parts_of_a_map_that_are_asked_for_in_one_call_are_solved_each_by_itself() -> None:
+    free = np.ones((300, 300), dtype=bool)
+    free[:, 150] = False
+    world = GridWorld(free)
+    goals = np.array([5, 295])
+    asked = world.states_of([[3, 3], [290, 4], [150, 7]])
+    found = world.first_passage(goals, 1e-6, states=asked)
+    everywhere = world.first_passage(goals, 1e-12)
+    np.testing.assert_allclose(found[asked], everywhere[asked], rtol=1e-6)
+    assert np.count_nonzero(found) < 0.2 * np.count_nonzero(everywhere)
+
+
+@settings(max_examples=25)
+@given(mazes(), st.integers(0, 2**32 - 1))
+def test_goals_solved_together_are_those_solved_one_by_one(world: GridWorld, seed: int) -> None:
+    goals = np.flatnonzero(world.free)
+    goals = np.random.default_rng(seed).choice(goals, min(len(goals), 30))  # some of them twice
+    together = world.first_passage(goals, 1e-9)
+    for lane, goal in enumerate(goals):
+        alone = world.first_passage(np.array([goal]), 1e-9)
+        np.testing.assert_allclose(together[:, lane], alone[:, 0], rtol=2e-9)
+
+
+def test_a_residual_is_enough_where_it_is_allowed() -> None:
+    world = GridWorld(np.ones((40, 40), dtype=bool))
+    found = world.first_passage(np.array([5]), 1e-30, residual=1e-7)[:, 0]
+    means = world.expected_values(found[:, None], np.arange(1600))[:, :, 0].max(axis=1)
+    change = np.delete(np.abs(world.discount * means / found - 1.0), 5)
+    assert 1e-13 < change.max() <= 1e-7

@@ -128,7 +128,11 @@ class FiniteMDP:
         _solve(*self._motion, self.discount, rewards, goals, tolerance, values)
 
     def first_passage(
-        self, goals: npt.NDArray[np.int64], tolerance: float
+        self,
+        goals: npt.NDArray[np.int64],
+        tolerance: float,
+        residual: float = 0.0,
+        states: npt.NDArray[np.int64] | None = None,
     ) -> npt.NDArray[np.float64]:
         """See `bnirl_ros.mdp.process.MarkovDecisionProcess.first_passage`."""
         return first_passage_by_sweeps(self, goals, tolerance)

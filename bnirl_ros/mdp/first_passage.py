@@ -1,282 +1,268 @@
-"""First-passage values of a grid world, in sweeps along the wave that runs out from each goal.
+"""First-passage values of a grid world, in a band of sweeps that moves out from the goals.
 
 The discounted first-passage value h(s) of a goal g is the mean of gamma ** (steps until g) under
 the policy that makes it largest: h(g) = 1, and h(s) = gamma max_a E[h(s')] elsewhere.
 
-A Gauss-Seidel sweep that takes the cells in the order in which a wave from the goal reaches them
-settles the near ones, but carries little of that further: where the cells behind the wave have
-changed by a factor, those before it still have their old values, and hold it back. It is the
-ratios of neighbours that are nearly right, not the values. So every other sweep takes the cells
-not reached yet as if they were to change by the same factor as the cell itself: with U the part
-of E[h] that lies behind the wave and D the old part before it,
+A sweep that takes the cells in the order in which a wave from the goal reaches them carries the
+values outwards, but where the near ones are still wrong all that lies behind them is: over a whole
+map it takes the more sweeps the larger the map. What lies farther out, on the other hand, hardly
+acts on a cell: a demonstrator seldom goes back. So the sweeps go over a band of some tens of moves
+only, which moves out as the cells at its inner edge settle. A cell that enters it is given the
+value of its neighbours behind, less what a move costs. Some twenty sweeps pass over each cell,
+whatever the size of the map, and the band fits into the caches.
 
-    h = U + D h / h_old,  or  h = U / (1 - D / h_old).
+A sweep is successive over-relaxation. Goals that lie near each other are solved in the lanes of
+vectors, in one order. A last sweep without over-relaxation, over all cells, tells how far off the
+values can be at most: see `bnirl_ros.mdp.band.amplification`.
 
-Its fixed point is the same. The sweeps between, which are plain ones, tell how far off the values
-can be at most: see `_amplification`.
+Where only a part of a large map is asked for, the wave ends a margin behind it. The values are
+then a lower bound, as if who leaves that part never came back; `_gap` finds an upper one. The
+margin is widened until the two agree.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
-STRAIGHT, DIAGONAL = 8, 9
-"""What a move costs the wave. By the order of values a diagonal move is a little dearer: the
-noise on the way does less harm beside it than before and behind."""
+from bnirl_ros.mdp.band import FINEST, LEAST, Law, amplification, neighbours_in_order, settle
+from bnirl_ros.mdp.wave import DIAGONAL, EVERYWHERE, STRAIGHT, Wave, rest, spread
 
-_BUCKETS = 16  # more than the dearest move; the wave's front is kept in so many lists by cost
-_FAR = np.int32(2**31 - 1)
-_FINEST = 2e-15  # changes by this factor are rounding
-_LEAST = 1e-280  # smaller values are as good as none
-_STEADIEST = 0.3  # the least 1 - D / h_old that is divided by
-_NO_NAN = {"nnan", "ninf", "nsz"}  # nothing that changes a value: the order of sums is kept
-_PATIENCE = 20  # sweeps in which no further cell settles, after which all are plain ones
+_MOST_LANES = 8  # goals solved together at most
+_WIDTH = 4  # and the lanes are a multiple of this, unless it is a single goal
+_TOGETHER = 40 * STRAIGHT  # goals solved together lie so near the first of them
+_MARGIN = 32 * STRAIGHT  # at first, behind what is asked for
+_BEYOND = 1.3  # h outside of what was reached is sought below so many times that at the edge
+_MORE = 1.3  # over-relaxation, beyond 1, for Young's
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def first_passage_values(  # type: ignore[no-untyped-def]
-    open_moves, offsets, costs, success, spread, discount, goals, tolerance
-):
-    """(S, L) h of each of the goals (L,), with an error of at most h times `tolerance`.
+class Motion(NamedTuple):
+    """How the demonstrator moves on a map.
 
-    Zero where a goal cannot be reached from.
-
-    Args:
-        open_moves: (S,) bit sets of the moves that are not blocked; 0 for a blocked cell.
-        offsets: tuple of what each action adds to the state number; staying is the first.
-        costs: tuple of what each of them costs the wave.
+    Attributes:
+        open_moves: (S,) uint16 bit sets of the moves that are not blocked; 0 for a blocked cell.
+        offsets: what each action adds to the state number; staying is the first.
+        costs: what each of them costs the wave.
         success, spread: probability of the chosen action's outcome, and of each other one; the
             first is the larger.
         discount: gamma, above 0.
-        goals: state numbers.
-        tolerance: bound on the relative error of all values above 1e-280; rounding comes on top.
     """
-    state_count = open_moves.shape[0]
-    values = np.zeros((state_count, goals.shape[0]))
-    value = np.empty(state_count)
-    order = np.empty(state_count, dtype=np.int32)
-    behind = np.empty(state_count, dtype=np.uint16)
-    place, cost, following, before = np.empty((4, state_count), dtype=np.int32)
-    chosen, other = discount * (success - spread), discount * spread
-    decay = _decay(chosen, other, len(offsets))
-    for lane in range(goals.shape[0]):
-        reached = _wave(
-            open_moves, offsets, costs, goals[lane], order, behind, place, cost, following, before
-        )
-        for number in range(reached):
-            state = order[number]
-            value[state] = math.exp(decay * cost[state])
-        _relax(
-            open_moves,
-            offsets,
-            chosen,
-            other,
-            discount,
-            order[:reached],
-            behind,
-            tolerance,
-            value,
-        )
-        for number in range(reached):
-            values[order[number], lane] = value[order[number]]
+
+    open_moves: npt.NDArray[np.uint16]
+    offsets: tuple[int, ...]
+    costs: tuple[int, ...]
+    success: float
+    spread: float
+    discount: float
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Cells in the order of a wave.
+
+    Attributes:
+        neighbours: (rows, A - 1) from `neighbours_in_order`.
+        distance: (rows,) int32 what each one costs the wave.
+        rows_of_goals: (L,) of each lane.
+    """
+
+    neighbours: npt.NDArray[np.uint32]
+    distance: npt.NDArray[np.int32]
+    rows_of_goals: npt.NDArray[np.int64]
+
+    @property
+    def whole(self) -> bool:
+        """Whether no move leads to where the wave has not come."""
+        return not (self.neighbours == len(self.distance)).any()
+
+
+def first_passage_values(
+    motion: Motion,
+    goals: npt.NDArray[np.int64],
+    tolerance: float,
+    residual: float,
+    asked: npt.NDArray[np.int64],
+    part_of: npt.NDArray[np.int32],
+) -> npt.NDArray[np.float64]:
+    """(S, L) h of each of the goals (L,).
+
+    Zero where a goal cannot be reached from, and far from where it is asked for.
+
+    Args:
+        motion: how the demonstrator moves.
+        goals: state numbers, each once.
+        tolerance: bound on the relative error of all values above 1e-280; rounding comes on top.
+        residual: where the whole map is solved it is enough, too, that no value differs from
+            gamma max_a E[h] by more than this part of itself.
+        asked: (U,) states whose values are asked for, each once; (0,) for all.
+        part_of: (S,) number of the connected part of the map in which each state lies.
+    """
+    law = _law(motion)
+    wave = Wave.at_rest(len(part_of))
+    values = np.zeros((len(part_of), len(goals)))  # pages that nobody writes cost nothing
+    column_of = dict(zip(goals.tolist(), range(len(goals)), strict=True))
+    is_left = np.zeros(len(part_of), dtype=np.bool_)
+    is_left[goals] = True
+    is_asked = np.zeros(len(part_of), dtype=np.bool_)
+    is_asked[asked] = True
+    for goal in goals:
+        if is_left[goal]:
+            left_here = int((is_left[goals] & (part_of[goals] == part_of[goal])).sum())
+            near = _near(motion, goal, is_left, min(left_here, _MOST_LANES), wave)
+            asked_here = int((part_of[asked] == part_of[goal]).sum())
+            order, value = _solve(
+                motion, law, near, tolerance, residual, is_asked, asked_here, wave
+            )
+            columns = [column_of[state] for state in near.tolist()]
+            _put(order, np.array(columns), value, values)
+            is_left[near] = False
     return values
 
 
 @njit(nogil=True, cache=True)
-def _decay(chosen, other, actions):  # type: ignore[no-untyped-def]
-    """By how much log h falls for each unit of the wave's cost, far from everything."""
-    sides = 3 if actions > 5 else 1  # outcomes that go on, and as many that go back
-    step = 0.9
+def _put(order, columns, value, values):  # type: ignore[no-untyped-def]
+    """Put rows into the order of the states, and lanes into their columns."""
+    for row in range(order.shape[0]):
+        for lane in range(columns.shape[0]):
+            values[order[row], columns[lane]] = value[row, lane]
+
+
+def _law(motion: Motion) -> Law:
+    """How values follow from those of the neighbours."""
+    chosen = motion.discount * (motion.success - motion.spread)
+    other = motion.discount * motion.spread
+    # Discounted probability that a straight move leads on and back; to each side, and nowhere, it
+    # does with `other`.
+    sides = 3 if len(motion.offsets) > 5 else 1
+    onwards, back = chosen + sides * other, sides * other
+    stays = other * (len(motion.offsets) - 2 * sides)
+    step = 0.9  # what a straight move takes of h, far from everything
     for _ in range(100):
-        step = chosen + other * (sides * (1.0 + step * step) + (actions - 2 * sides) * step)
-    return math.log(max(step, _LEAST)) / STRAIGHT
+        step = onwards + back * step * step + stays * step
+    decay = math.log(max(step, LEAST)) / STRAIGHT
+    # Young's factor for a wave that runs straight on, far from everything. A little more was the
+    # best in trials: over the first cells that count, distances shrink faster.
+    radius = 2.0 * (math.sqrt(onwards * back) + other) / (1.0 - other)
+    young = 2.0 / (1.0 + math.sqrt(max(0.0, 1.0 - radius * radius)))
+    return Law(
+        chosen=chosen,
+        other=other,
+        discount=motion.discount,
+        fades=tuple(math.exp(decay * cost) for cost in motion.costs[1:]),
+        omega=1.0 + _MORE * (young - 1.0),
+    )
 
 
-@njit(nogil=True, cache=True)
-def _wave(  # type: ignore[no-untyped-def]
-    open_moves, offsets, costs, goal, order, behind, place, cost, following, before
-):
-    """The order in which a wave from the goal reaches cells; returns how many it reaches.
+def _near(
+    motion: Motion, goal: int, is_left: npt.NDArray[np.bool_], most: int, wave: Wave
+) -> npt.NDArray[np.int64]:
+    """A goal and those near it that are left, so many at most."""
+    first = np.array([goal], dtype=np.int64)
+    if most == 1:
+        return first
+    ways = motion.open_moves, motion.offsets, motion.costs
+    reached = spread(*ways, first, is_left, most, 0, _TOGETHER, wave)
+    order = wave.order[:reached]
+    near = order[is_left[order]][:most].astype(np.int64)
+    rest(wave, reached)
+    return near
 
-    Dial's algorithm: cells that wait are in a ring of linked lists, one for each cost.
+
+def _solve(
+    motion: Motion,
+    law: Law,
+    goals: npt.NDArray[np.int64],
+    tolerance: float,
+    residual: float,
+    is_asked: npt.NDArray[np.bool_],
+    asked: int,
+    wave: Wave,
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float64]]:
+    """States (rows,) in the order of the wave, and h (rows, L) of each of the goals there.
 
     Args:
-        open_moves, offsets, costs, goal: as above.
-        order: (S,) the cells that are reached, in their order.
-        behind: (S,) for each of them the bit set of moves to cells that were reached before.
-        place: (S,) each cell's place in the order; -1 where it is not reached.
-        cost: (S,) what it costs to reach it.
-        following, before: (S,) its neighbours in the list in which it waits.
+        motion, law: how the demonstrator moves, and what follows for values.
+        goals: state numbers, near each other; there may be more lanes than goals.
+        tolerance, residual: as above.
+        is_asked: (S,) whether a state is asked for, and `asked` how many of this part of the map;
+            0 for all.
+        wave: one that is at rest, and will be again.
     """
-    first = np.full(_BUCKETS, -1, dtype=np.int32)
-    place[:] = -1
-    cost[:] = _FAR
-    cost[goal] = 0
-    first[0] = goal
-    following[goal] = before[goal] = -1
-    reached, waiting, now = 0, 1, 0
-    while waiting > 0:
-        state = first[now % _BUCKETS]
-        if state < 0:
-            now += 1
-            continue
-        after = following[state]
-        first[now % _BUCKETS] = after
-        if after >= 0:
-            before[after] = -1
-        waiting -= 1
-        place[state] = reached
-        order[reached] = state
-        bits = np.int64(open_moves[state])
-        behind_bits = 0
-        for action in range(1, len(offsets)):
-            if not (bits >> action) & 1:
-                continue
-            outcome = state + offsets[action]
-            if place[outcome] >= 0:
-                behind_bits |= 1 << action
-                continue
-            through = now + costs[action]
-            if through >= cost[outcome]:
-                continue
-            if cost[outcome] == _FAR:
-                waiting += 1
-            else:
-                left, right = before[outcome], following[outcome]
-                if left >= 0:
-                    following[left] = right
-                else:
-                    first[cost[outcome] % _BUCKETS] = right
-                if right >= 0:
-                    before[right] = left
-            cost[outcome] = through
-            head = first[through % _BUCKETS]
-            following[outcome] = head
-            before[outcome] = -1
-            if head >= 0:
-                before[head] = outcome
-            first[through % _BUCKETS] = outcome
-        behind[reached] = behind_bits
-        reached += 1
-    return reached
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _relax(  # type: ignore[no-untyped-def]
-    open_moves, offsets, chosen, other, discount, order, behind, tolerance, value
-):
-    """Bring `value` (S,) to h, within h times `tolerance`."""
-    wanted, fewest, stuck = tolerance, order.shape[0] + 1, 0
+    ways = motion.open_moves, motion.offsets, motion.costs
+    lanes = np.arange(-(-len(goals) // _WIDTH) * _WIDTH if len(goals) > 1 else 1)
+    goal_of_lane = goals[np.where(lanes < len(goals), lanes, 0)]
+    margin = _MARGIN
     while True:
-        if stuck < _PATIENCE:
-            _rescaling_sweep(open_moves, offsets, chosen, other, discount, order, behind, value)
-        change, least, unsettled = _plain_sweep(
-            open_moves, offsets, chosen, other, order, wanted, value
+        reached = spread(*ways, goals, is_asked, asked, margin, EVERYWHERE, wave)
+        order = wave.order[:reached].copy()
+        rows = _Rows(
+            neighbours_in_order(*ways[:2], order, wave.place),
+            wave.cost[order],
+            wave.place[goal_of_lane].astype(np.int64),
         )
-        wanted = max(_FINEST, tolerance / _amplification(least, discount))
-        if change <= wanted:
-            return
-        if unsettled < fewest:
-            fewest, stuck = unsettled, 0 if stuck < _PATIENCE else stuck
-        else:
-            stuck += 1
+        rest(wave, reached)
+        value = np.zeros((reached + 1, len(lanes)))
+        if rows.whole:
+            _settle(law, rows, tolerance, residual, 0, value)
+            return order, value[:-1]
+        _settle(law, rows, tolerance / 2.0, 0.0, 0, value)
+        rounding = FINEST * amplification(value[:-1].min(), law.discount)
+        gap = _gap(law, rows, tolerance / 2.0, np.flatnonzero(is_asked[order]), value)
+        if gap <= max(tolerance / 2.0, rounding):
+            return order, value[:-1]
+        margin += margin // 2
 
 
-@njit(nogil=True, cache=True)
-def _amplification(least, discount):  # type: ignore[no-untyped-def]
-    """How much larger the relative error can be than the relative change in a plain sweep.
+def _settle(
+    law: Law,
+    rows: _Rows,
+    tolerance: float,
+    residual: float,
+    outer: int,
+    value: npt.NDArray[np.float64],
+) -> None:
+    """Bring values (rows + 1, L) to h; the last row is kept, and the first `outer` are begun."""
+    least = law.fades[0] ** (rows.distance[-1] / STRAIGHT)  # about that; the first is straight
+    wanted = max(FINEST, residual, tolerance / amplification(least, law.discount))
+    columns = rows.neighbours, rows.distance, rows.rows_of_goals
+    settle(law, *columns, tolerance, residual, wanted, outer, value.reshape(-1))
 
-    Let h be values of which the least is `least`, and the operator T change them by no more than
-    d h; after a sweep that changed no value by a larger part than d that is so, since what changed
-    after a cell had its turn is only a part of its mean. For every policy gamma P h <= (1 + d) h,
-    and so by Jensen's inequality gamma P w <= gamma ** t (1 + d) ** (1 - t) w with
-    w = h ** (1 - t) for any t in (0, 1]: in the norm weighted by w, T is a contraction. Hence
-    |h* - h| <= d w / (1 - gamma ** t), but for terms of the order d ** 2, and relative to h that
-    is d h ** -t / (1 - gamma ** t). With t = 1 it is the common bound on the absolute error, over
-    the least value; far from the goal a smaller t says much more.
+
+def _gap(
+    law: Law,
+    rows: _Rows,
+    tolerance: float,
+    rows_asked: npt.NDArray[np.int64],
+    value: npt.NDArray[np.float64],
+) -> float:
+    """By how much of itself h can be larger in some rows than where nothing lies farther out.
+
+    Whoever leaves what was reached is so many moves away from every goal, at least: that bounds h
+    there. Mostly a smaller M will do: if h is M outside, and then gamma h is at most M at the edge
+    and so after every move from outside, M and that h satisfy h >= gamma max_a E[h] everywhere,
+    and the true values are not above them.
+
+    Args:
+        law, rows: what was reached.
+        tolerance: bound on the relative error of either bound.
+        rows_asked: (U,).
+        value: (rows + 1, L) h, where the last row, which is all that was not reached, is zero.
     """
-    steps = -math.log(max(least, _LEAST))  # in nats, from the goal to the farthest cell
-    t = 1.0 / max(1.0, steps)
-    return math.exp(t * steps) / (1.0 - discount**t)
-
-
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=_NO_NAN)
-def _rescaling_sweep(  # type: ignore[no-untyped-def]
-    open_moves, offsets, chosen, other, discount, order, behind, value
-):
-    """A sweep in which what lies before the wave changes as the cell itself does."""
-    all_open = (1 << len(offsets)) - 1
-    for number in range(1, order.shape[0]):
-        state = order[number]
-        bits, behind_bits = np.int64(open_moves[state]), np.int64(behind[number])
-        old = value[state]
-        total_behind, best_behind = 0.0, 0.0
-        total_before, best_before = old, old
-        if bits == all_open:
-            for action in range(1, len(offsets)):
-                outcome_value = value[state + offsets[action]]
-                if (behind_bits >> action) & 1:
-                    total_behind += outcome_value
-                    best_behind = max(best_behind, outcome_value)
-                else:
-                    total_before += outcome_value
-                    best_before = max(best_before, outcome_value)
-        else:  # the same where some moves stay; testing each costs as much as all the rest
-            for action in range(1, len(offsets)):
-                step = offsets[action] if (bits >> action) & 1 else 0
-                outcome_value = value[state + step]
-                if (behind_bits >> action) & 1:
-                    total_behind += outcome_value
-                    best_behind = max(best_behind, outcome_value)
-                else:
-                    total_before += outcome_value
-                    best_before = max(best_before, outcome_value)
-        left = old - other * total_before
-        if best_before > best_behind or left <= _STEADIEST * old:
-            best = max(best_before, best_behind)
-            value[state] = other * (total_behind + total_before) + chosen * best
-        else:
-            # No mean over outcomes is more than the largest of them.
-            largest = discount * best_behind
-            rescaled = (other * total_behind + chosen * best_behind) * old / left
-            value[state] = min(rescaled, largest)
-
-
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=_NO_NAN)
-def _plain_sweep(  # type: ignore[no-untyped-def]
-    open_moves, offsets, chosen, other, order, wanted, value
-):
-    """A sweep of Gauss and Seidel.
-
-    Returns:
-        The largest relative change, the least value, and how many changed by more than `wanted`.
-    """
-    all_open = (1 << len(offsets)) - 1
-    change, least, unsettled = 0.0, 1.0, 0
-    for number in range(1, order.shape[0]):
-        state = order[number]
-        bits = np.int64(open_moves[state])
-        old = value[state]
-        total, best = old, old
-        if bits == all_open:
-            for action in range(1, len(offsets)):
-                outcome_value = value[state + offsets[action]]
-                total += outcome_value
-                best = max(best, outcome_value)
-        else:
-            for action in range(1, len(offsets)):
-                step = offsets[action] if (bits >> action) & 1 else 0
-                outcome_value = value[state + step]
-                total += outcome_value
-                best = max(best, outcome_value)
-        new = other * total + chosen * best
-        difference = abs(new - old)
-        if difference > change * new and new > _LEAST:
-            change = difference / new
-        unsettled += difference > wanted * new
-        least = min(least, new)
-        value[state] = new
-    return change, least, unsettled
+    edge = (rows.neighbours == len(rows.distance)).any(axis=1)
+    moves = math.ceil(rows.distance[-1] / DIAGONAL)
+    farthest = law.discount**moves
+    upper = value.copy()
+    upper[-1] = np.minimum(_BEYOND * law.discount * value[:-1][edge].max(axis=0), farthest)
+    _settle(law, rows, tolerance, 0.0, len(rows.distance), upper)
+    at_edge = law.discount * upper[:-1][edge].max(axis=0)
+    proved = (at_edge <= 0.99 * upper[-1]) | (upper[-1] == farthest)  # 0.01 for its own error
+    if not proved.all():
+        upper[-1] = np.where(proved, upper[-1], farthest)
+        _settle(law, rows, tolerance, 0.0, len(rows.distance), upper)
+    lower, upper = value[rows_asked], upper[rows_asked]
+    return float(np.max(upper[lower > LEAST] / lower[lower > LEAST], initial=1.0)) - 1.0

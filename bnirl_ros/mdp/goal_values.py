@@ -43,24 +43,29 @@ def goal_values(
     all_goals = goals if isinstance(goals, Goals) else Goals.of_states(goals)
     checked_states(mdp, all_goals.states, "goal")
     observed = checked_states(mdp, states, "state")
-    # dQ <= V(g) dh + V(g)^2 dh with V(g) <= 1 / (1 - gamma): so an error dh of h is allowed.
-    first_passage_tolerance = tolerance * (1.0 - mdp.discount) ** 2 / (2.0 - mdp.discount)
+    # With V(g) <= 1 / (1 - gamma), dQ <= V(g) dh + V(g)^2 dh: so an error dh of h is allowed. And
+    # if gamma max_a E[h] differs from h by r, R + gamma max_a E[V] differs from V by V(g) r.
+    residual = tolerance * (1.0 - mdp.discount) ** 2
+    first_passage_tolerance = residual / (2.0 - mdp.discount)
     values = np.empty((len(observed), len(mdp.actions), len(all_goals)))
 
     def solve(batch: npt.NDArray[np.int64]) -> None:
         if all_goals.sizes[batch[0]] == 1:
             single = all_goals.states[all_goals.first[batch]]
-            values[:, :, batch] = _of_single_states(mdp, single, observed, first_passage_tolerance)
+            values[:, :, batch] = _of_single_states(
+                mdp, single, observed, first_passage_tolerance, residual
+            )
         else:
             rewards = all_goals.rewards(batch, mdp.state_count)
             of_state = optimal_values(mdp, rewards, tolerance)
             values[:, :, batch] = action_values(mdp, rewards, of_state, observed)
 
-    batches = [
-        kind[start : start + _GOALS_AT_ONCE]
-        for kind in (np.flatnonzero(all_goals.sizes == 1), np.flatnonzero(all_goals.sizes > 1))
-        for start in range(0, len(kind), _GOALS_AT_ONCE)
-    ]
+    single = np.flatnonzero(all_goals.sizes == 1)
+    places = mdp.places_of(all_goals.states[all_goals.first[single]])
+    several = np.flatnonzero(all_goals.sizes > 1)
+    batches = [single[near] for near in _near_together(places)]
+    batches += np.split(several, range(_GOALS_AT_ONCE, len(several), _GOALS_AT_ONCE))
+    batches = [batch for batch in batches if len(batch)]
     with workers(len(batches)) as threads:
         try:
             list(threads.map(solve, batches))
@@ -75,12 +80,28 @@ def _of_single_states(
     goals: npt.NDArray[np.int64],
     states: npt.NDArray[np.int64],
     tolerance: float,
+    residual: float,
 ) -> npt.NDArray[np.float64]:
     """Q* (U, A, L): V_g = h_g V_g(g), where V_g(g) = 1 + gamma V_g(g) max_a E[h_g]."""
     lanes = np.arange(len(goals))
-    first_passage = mdp.first_passage(goals, tolerance)
+    first_passage = mdp.first_passage(goals, tolerance, residual, states)
     from_goal = mdp.expected_values(first_passage, goals)[lanes, :, lanes].max(axis=1)
     goal_value = 1.0 / (1.0 - mdp.discount * from_goal)
     reward = (states[:, np.newaxis] == goals).astype(np.float64)
     expected = mdp.expected_values(first_passage, states)
     return np.asarray(reward[:, np.newaxis] + mdp.discount * goal_value * expected)
+
+
+def _near_together(places: npt.NDArray[np.int64]) -> list[npt.NDArray[np.int64]]:
+    """Indices of places (N, 2) in groups that can be solved at once, each of near ones."""
+    groups, whole = [], [np.arange(len(places))]
+    while whole:
+        group = whole.pop()
+        if len(group) <= _GOALS_AT_ONCE:
+            groups.append(group)
+            continue
+        extent = np.ptp(places[group], axis=0)
+        group = group[np.argsort(places[group, extent.argmax()], kind="stable")]
+        middle = -(-len(group) // (2 * _GOALS_AT_ONCE)) * _GOALS_AT_ONCE
+        whole += [group[:middle], group[middle:]]
+    return groups

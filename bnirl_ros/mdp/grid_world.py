@@ -11,8 +11,9 @@ import numpy.typing as npt
 from numba import njit
 
 from bnirl_ros.mdp.actions import ACTION_SETS, STEPS
-from bnirl_ros.mdp.first_passage import DIAGONAL, STRAIGHT, first_passage_values
+from bnirl_ros.mdp.first_passage import Motion, first_passage_values
 from bnirl_ros.mdp.process import first_passage_by_sweeps
+from bnirl_ros.mdp.wave import DIAGONAL, STRAIGHT
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,9 +119,12 @@ class GridWorld:
 
     def outcomes(self) -> npt.NDArray[np.int64]:
         """(S, A) state to which each action leads from each state when it succeeds."""
-        states = np.arange(self.state_count)[:, None]
-        is_open = (self.open_moves.reshape(-1, 1) >> np.arange(len(self.offsets))) & 1
-        return np.where(is_open, states + self.offsets, states)
+        return self._outcomes_of(np.arange(self.state_count))
+
+    def _outcomes_of(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """(U, A) the same from each of the states (U,)."""
+        is_open = (self.open_moves.reshape(-1)[states, None] >> np.arange(len(self.offsets))) & 1
+        return np.where(is_open, states[:, None] + self.offsets, states[:, None])
 
     def transitions(self) -> list[Any]:
         """Transition probabilities, an array (S, S) in compressed sparse rows for each action."""
@@ -155,28 +159,38 @@ class GridWorld:
         _solve(*self._motion, self.discount, rewards, goals, tolerance, values)
 
     def first_passage(
-        self, goals: npt.NDArray[np.int64], tolerance: float
+        self,
+        goals: npt.NDArray[np.int64],
+        tolerance: float,
+        residual: float = 0.0,
+        states: npt.NDArray[np.int64] | None = None,
     ) -> npt.NDArray[np.float64]:
         """See `bnirl_ros.mdp.process.MarkovDecisionProcess.first_passage`.
 
         The bound is on the relative error, unless an action leads elsewhere more often than where
-        it is meant to.
+        it is meant to. Of a large map only that part is solved which decides about `states` and
+        the states around them and the goals; the other values are zero.
         """
         open_moves, offsets, success, spread = self._motion
         if success <= spread or self.discount == 0.0:
             return first_passage_by_sweeps(self, goals, tolerance)
         is_diagonal = STEPS[self.actions].all(axis=1)
-        values: npt.NDArray[np.float64] = first_passage_values(
-            open_moves.reshape(-1),
-            tuple(offsets.tolist()),
-            tuple(np.where(is_diagonal, DIAGONAL, STRAIGHT).tolist()),
-            success,
-            spread,
-            self.discount,
-            goals,
-            tolerance,
+        motion = Motion(
+            open_moves=open_moves.reshape(-1),
+            offsets=tuple(offsets.tolist()),
+            costs=tuple(np.where(is_diagonal, DIAGONAL, STRAIGHT).tolist()),
+            success=success,
+            spread=spread,
+            discount=self.discount,
         )
-        return values
+        asked = np.zeros(0, dtype=np.int64)
+        if states is not None:
+            asked = np.unique(self._outcomes_of(np.concatenate([states, goals])))
+        each, column_of = np.unique(goals, return_inverse=True)
+        values = first_passage_values(
+            motion, each, tolerance, residual, asked, self._part_of_state
+        )
+        return values if np.array_equal(each, goals) else values[:, column_of]
 
     def expected_values(
         self, values: npt.NDArray[np.float64], states: npt.NDArray[np.int64]

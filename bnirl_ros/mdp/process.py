@@ -45,7 +45,11 @@ class MarkovDecisionProcess(Protocol):
         """
 
     def first_passage(
-        self, goals: npt.NDArray[np.int64], tolerance: float
+        self,
+        goals: npt.NDArray[np.int64],
+        tolerance: float,
+        residual: float = 0.0,
+        states: npt.NDArray[np.int64] | None = None,
     ) -> npt.NDArray[np.float64]:
         """(S, L) discounted first-passage values of the goals (L,).
 
@@ -54,6 +58,10 @@ class MarkovDecisionProcess(Protocol):
         Args:
             goals: state numbers.
             tolerance: bound on the error.
+            residual: it is enough, too, that no value differs from gamma max_a E[h] by a larger
+                part of itself than this.
+            states: (U,) those from which the values after all actions are to be right, as from
+                the goals; by default all.
         """
         ...
 
