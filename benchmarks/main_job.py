@@ -65,7 +65,11 @@ def benchmark_bag(name: str, settings: Settings) -> None:
     with tempfile.TemporaryDirectory() as out:
         timed("  bnirl infer, as a process", 5, lambda: command(bag, settings, Path(out)))
     posterior = infer(demonstration, grid_map, settings)
-    print(f"  R-hat {posterior.rhat:.3f}, effective sample size {posterior.ess:.0f}")
+    agreed = posterior.convergence
+    print(
+        f"  R-hat {agreed.rhat:.3f}, effective sample size {agreed.ess:.0f} of {agreed.ess_of}, "
+        f"{posterior.ess_per_second:.0f} a second"
+    )
 
 
 def main() -> None:

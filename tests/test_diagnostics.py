@@ -50,3 +50,4 @@ def test_undefined_where_nothing_varies_or_there_is_one_chain() -> None:
 
 def test_chains_that_stand_still_apart_have_not_converged() -> None:
     assert rhat(np.repeat([[1.0], [2.0]], 50, axis=1)) == float("inf")
+    assert rhat(np.repeat([[0.0], [1.0], [0.0], [1.0]], 800, axis=1)) == float("inf")

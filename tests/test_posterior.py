@@ -100,7 +100,7 @@ def test_equal_seeds_give_equal_posteriors_and_others_do_not(posterior: Posterio
 def test_chains_do_not_depend_on_how_many_there_are(posterior: Posterior) -> None:
     one = infer(ROUND, MAP, replace(posterior.settings, chains=1))
     np.testing.assert_array_equal(one.draws.subgoal_of[0], posterior.draws.subgoal_of[0])
-    assert one.rhat is None
+    assert one.convergence.rhat is None
 
 
 def test_chains_do_not_depend_on_the_number_of_cores(

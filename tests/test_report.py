@@ -21,6 +21,7 @@ from PIL import Image
 from bnirl_ros import cli
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.experiments.scenarios import PAPER_LOOP, shipped_demonstration
+from bnirl_ros.inference.convergence import NOTHING_DRAWN
 from bnirl_ros.inference.posterior import Posterior, infer
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.inference.summary import Summary, summarise
@@ -241,8 +242,7 @@ def test_a_page_of_nothing_but_slips(loop: Told) -> None:
         rank_of_candidate=np.zeros_like(loop.summary.rank_of_candidate),
         pursuits=(),
         unexplained=1.0,
-        rhat=None,
-        ess=None,
+        convergence=NOTHING_DRAWN,
     )
     page = dataclasses.replace(loop, summary=nothing).page()
     assert "No subgoal explains any of 299 observations in 5 episodes." in page

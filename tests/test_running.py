@@ -70,8 +70,8 @@ def test_running_chains_agree_with_fresh_ones(model: str) -> None:
         running.advance(10)
     assert running is not None
     posterior = finished(running).posterior()
-    assert posterior.rhat is not None
-    assert posterior.rhat < 1.05
+    assert posterior.convergence.rhat is not None
+    assert posterior.convergence.rhat < 1.05
     np.testing.assert_array_equal(posterior.mode.subgoal_of, fresh.mode.subgoal_of)
     if model == "paper":  # the other's mode is one at the medians of the draws' parameters
         assert posterior.mode.log_joint == pytest.approx(fresh.mode.log_joint)

@@ -17,6 +17,7 @@ import pytest
 from matplotlib.text import Text
 from PIL import Image
 
+from bnirl_ros.inference.convergence import Convergence
 from bnirl_ros.inference.intent import Intent
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.inference.summary import Parameter, Pursuit, Subgoal, Summary, nothing_found
@@ -83,10 +84,8 @@ def summary(grid_map: GridMap) -> Summary:
         ),
         rank_of=rank_of,
         cell_probability=belief,
-        rhat=1.0,
-        ess=100.0,
-        chains=4,
-        draws=800,
+        convergence=Convergence(1.0, 100.0, "the log joint", "alpha", chains=4, draws=800),
+        sampling=None,
     )
 
 

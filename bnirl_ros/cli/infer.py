@@ -11,6 +11,7 @@ from bnirl_ros.cli.inference import (
     DEMONSTRATION,
     add_inference,
     inferred,
+    print_rate,
     read,
     remappings_of,
     settings_of,
@@ -63,5 +64,6 @@ def _infer(options: argparse.Namespace) -> int:
     title = title_of(options.demonstrations) if options.report else None
     written = write_results(options.out, posterior, summary, grid_map, settings, title)
     print(report(summary))
+    print_rate(posterior)
     print(f"Written: {', '.join(str(file) for file in written)}")
     return told_of(damage)

@@ -201,6 +201,16 @@ def inferred(demonstration: Demonstration, grid_map: GridMap, settings: Settings
         return infer(demonstration, grid_map, settings, progress)
 
 
+def print_rate(posterior: Posterior) -> None:
+    """Say how long the sweeps took, and how many effective samples came of that."""
+    sampling, rate = posterior.sampling, posterior.ess_per_second
+    words = f"{sampling.sweeps:,} sweeps took {sampling.seconds:.3g} s"
+    if rate is not None:
+        number = format(rate, ",.0f" if rate >= 10.0 else ".2g")
+        words += f": {number} effective samples a second, of {posterior.convergence.ess_of}"
+    print(words)
+
+
 def told_of(damage: str | None) -> int:
     """Exit status 0, unless a file was damaged, which is told last."""
     if damage:

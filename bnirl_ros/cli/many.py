@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bnirl_ros.cli.inference import in_spite_of, inferred, map_of, reading_of, told
+from bnirl_ros.cli.inference import in_spite_of, inferred, map_of, print_rate, reading_of, told
 from bnirl_ros.cli.terminal import progress_bar, warn
 from bnirl_ros.errors import InputError
 from bnirl_ros.limits import one_or_more
@@ -115,6 +115,7 @@ def _infer_each(
             subgoals=found.subgoals,
             rhat=found.rhat,
             ess=found.ess,
+            converged=found.converged,
             left_out=found.left_out,
             damage=found.damage,
         )
@@ -183,6 +184,7 @@ def _infer_pooled(
     title = title_of([paths[number] for number in placed]) if options.report else None
     written = write_results(options.out, posterior, summary, grid_map, settings, title)
     print(report(summary))
+    print_rate(posterior)
     start = 0
     for number, each in placed.items():
         rows = slice(start, start + len(each.demonstration))

@@ -73,7 +73,7 @@ def _predict(options: argparse.Namespace) -> int:
     from bnirl_ros.inference.summary import summarise
     from bnirl_ros.views.predictions import cell_table, loss_table, write_predictions
     from bnirl_ros.views.results import check_writable
-    from bnirl_ros.views.tables import convergence
+    from bnirl_ros.views.tables import convergence, verdict
 
     demonstration, grid_map, damage = read(options, settings, remappings)
     for cell in options.cell:
@@ -99,6 +99,7 @@ def _predict(options: argparse.Namespace) -> int:
     else:
         print(cell_table(everything[0], posterior.candidates, grid_map))
     print(f"learnt from {convergence(summarise(posterior, grid_map))}")
+    print(verdict(posterior.convergence, posterior.sampling))
     print(f"Written: {', '.join(str(file) for file in written)}")
     return told_of(damage)
 

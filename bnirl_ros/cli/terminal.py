@@ -15,7 +15,8 @@ def progress_bar(
 
     Args:
         doing: what is done.
-        total: in how many steps; whoever does it tells how many more are done.
+        total: in how many steps; whoever does it tells how many more are done. Where there turn
+            out to be more, there are taken to be twice as many.
         before: what is done until the first ones are, if that is something else.
     """
     if not sys.stderr.isatty():
@@ -41,7 +42,10 @@ def progress_bar(
         task = bar.add_task(before or doing, total=None if before else total)
 
         def advance(steps: int) -> None:
+            nonlocal total
             bar.update(task, description=doing, total=total, advance=steps)
+            while bar.tasks[0].completed > total:
+                total *= 2
 
         yield advance
 

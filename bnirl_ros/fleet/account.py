@@ -30,6 +30,7 @@ class Account:
         episodes, observations: how many it has; None where it could not be used.
         subgoals: how many it has; of a pooled one, how many of all were pursued in it.
         rhat, ess: of its chains; None where undefined, and where it is pooled.
+        converged: whether its chains have; None where there are none, or it is pooled.
         left_out: what could not be used of it, counted by fault.
         damage: a sentence on where its file is damaged; None for a sound one.
         error: a sentence on why it could not be used; None where it could.
@@ -43,6 +44,7 @@ class Account:
     subgoals: int | None = None
     rhat: float | None = None
     ess: float | None = None
+    converged: bool | None = None
     left_out: Mapping[str, int] = field(default_factory=dict)
     damage: str | None = None
     error: str | None = None
@@ -94,6 +96,8 @@ def account_table(accounts: Sequence[Account], pooled: bool) -> str:
     }
     if not pooled:
         columns["R-hat"] = [_number(account.rhat, ".3f") for account in accounts]
+        told = {None: "-", False: "no", True: "yes"}
+        columns["converged"] = [told[account.converged] for account in accounts]
         columns["results"] = [account.folder or "failed" for account in accounts]
     else:
         columns["results"] = ["failed" if account.error else "pooled" for account in accounts]

@@ -24,6 +24,7 @@ class Inferred:
         files: contents of the result files, by name.
         episodes, observations, subgoals: how many there are.
         rhat, ess: of the chains; None where undefined.
+        converged: whether the chains have.
         left_out: what could not be used of the demonstration, counted by fault.
         damage: a sentence on where its file is damaged; None for a sound one.
     """
@@ -34,6 +35,7 @@ class Inferred:
     subgoals: int
     rhat: float | None
     ess: float | None
+    converged: bool
     left_out: Mapping[str, int]
     damage: str | None
 
@@ -79,6 +81,7 @@ def infer_from(
         subgoals=len(summary.subgoals),
         rhat=summary.rhat,
         ess=summary.ess,
+        converged=summary.convergence.reached,
         left_out=placed.left_out,
         damage=placed.damage,
     )

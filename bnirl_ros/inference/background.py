@@ -190,7 +190,7 @@ class BackgroundInference(Worker):
             request.cancel()
             return
         result = replace(
-            self._result_of(posterior, grid_map, placement, settings.sweeps),
+            self._result_of(posterior, grid_map, placement),
             posterior=posterior,
             settings=settings,
         )
@@ -219,17 +219,14 @@ class BackgroundInference(Worker):
             running.advance(4)
             if self._changed or running.finished or time.monotonic() > end:
                 break
-        return self._result_of(
-            running.posterior(), running.grid_map, running.placement, running.sweeps
-        )
+        return self._result_of(running.posterior(), running.grid_map, running.placement)
 
-    def _result_of(
-        self, posterior: Posterior, grid_map: GridMap, placement: Placement, sweeps: int
-    ) -> Result:
+    def _result_of(self, posterior: Posterior, grid_map: GridMap, placement: Placement) -> Result:
         """What a posterior says, and what tells the intent by it."""
         summary = summarise(posterior, grid_map)
         watching = None
         if posterior.settings.model == "sequential":
             watching = IntentFilter(posterior, summary, grid_map, self._watching)
         self._watching = watching
+        sweeps = posterior.sampling.sweeps
         return Result(grid_map, placement, summary, sweeps, watching)

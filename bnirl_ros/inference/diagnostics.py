@@ -7,6 +7,9 @@ from statistics import NormalDist
 import numpy as np
 import numpy.typing as npt
 
+FEWEST_DRAWS = 8
+"""Draws of each chain below which nothing can be told."""
+
 
 def rhat(values: npt.ArrayLike) -> float | None:
     """Rank-normalised split R-hat: the larger one of bulk and tail; 1 when chains agree.
@@ -21,7 +24,7 @@ def rhat(values: npt.ArrayLike) -> float | None:
     """
     chains = np.asarray(values, dtype=np.float64)
     halves = _split(chains)
-    if len(chains) < 2 or halves.shape[1] < 4 or np.ptp(halves) == 0.0:
+    if len(chains) < 2 or chains.shape[1] < FEWEST_DRAWS or np.ptp(halves) == 0.0:
         return None
     bulk = _plain_rhat(_rank_normalised(halves))
     tail = _plain_rhat(_rank_normalised(np.abs(halves - np.median(halves))))
@@ -39,8 +42,9 @@ def effective_sample_size(values: npt.ArrayLike) -> float | None:
     Returns:
         None for fewer than eight draws, or no variance.
     """
-    halves = _split(np.asarray(values, dtype=np.float64))
-    if halves.shape[1] < 4 or np.ptp(halves) == 0.0:
+    chains = np.asarray(values, dtype=np.float64)
+    halves = _split(chains)
+    if chains.shape[1] < FEWEST_DRAWS or np.ptp(halves) == 0.0:
         return None
     split = _rank_normalised(halves)
     count, length = split.shape
@@ -76,11 +80,11 @@ def _rank_normalised(chains: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]
 
 
 def _plain_rhat(chains: npt.NDArray[np.float64]) -> float:
+    if not np.ptp(chains, axis=1).any():  # every half-chain stands still: agreed, or never to be
+        return float("inf") if np.ptp(chains) else 1.0
     length = chains.shape[1]
     within = chains.var(axis=1, ddof=1).mean()
     between = length * chains.mean(axis=1).var(ddof=1)
-    if within == 0.0:  # every half-chain stands still: they agree, or never will
-        return 1.0 if between == 0.0 else float("inf")
     return float(np.sqrt((between / within + length - 1.0) / length))
 
 

@@ -41,6 +41,11 @@ class Draws:
         """A part along the leading axis, as a view."""
         return Draws(*(values[key] for values in vars(self).values()))
 
+    def drop_every_second(self) -> None:
+        """Of several chains' draws, an even number, the second, fourth, ... become the first."""
+        for values in vars(self).values():
+            values[:, : values.shape[1] // 2] = values[:, 1::2].copy()
+
     def __len__(self) -> int:
         return len(self.log_joint)
 

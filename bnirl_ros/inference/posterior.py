@@ -11,8 +11,8 @@ import numpy.typing as npt
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.errors import InputError
 from bnirl_ros.inference import mode, pursuit_mode
-from bnirl_ros.inference.chains import Progress, run_chains
-from bnirl_ros.inference.diagnostics import effective_sample_size, rhat
+from bnirl_ros.inference.chains import Progress, Sampling, run_until
+from bnirl_ros.inference.convergence import Convergence, convergence_of, traces_of
 from bnirl_ros.inference.draws import Draws
 from bnirl_ros.inference.mode import Mode
 from bnirl_ros.inference.runs import run_counts
@@ -22,7 +22,7 @@ from bnirl_ros.maps.grid_map import GridMap
 from bnirl_ros.mdp.grid_world import GridWorld
 from bnirl_ros.model.candidates import Candidates, candidates_of
 from bnirl_ros.model.mixture import SubgoalMixture, subgoal_mixture
-from bnirl_ros.model.pursuits import PursuitModel, pursuit_model
+from bnirl_ros.model.pursuits import PRIORS, PursuitModel, pursuit_model
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +36,8 @@ class Posterior:
         mode: the most probable partition with its subgoals.
         settings: with which they were drawn.
         model: of the demonstration, over the candidates.
-        rhat, ess: the worst one for log joint, number of partitions and inferred parameters, all
-            free of labels; None where undefined (`bnirl_ros.inference.diagnostics`).
+        sampling: how many sweeps there were, and what stopped them.
+        convergence: how far the chains agree.
     """
 
     candidates: Candidates
@@ -46,8 +46,14 @@ class Posterior:
     mode: Mode
     settings: Settings
     model: Model
-    rhat: float | None
-    ess: float | None
+    sampling: Sampling
+    convergence: Convergence
+
+    @property
+    def ess_per_second(self) -> float | None:
+        """Effective samples for each second of sampling [1/s]; it depends on the machine."""
+        ess = self.convergence.ess
+        return None if ess is None else ess / self.sampling.seconds
 
     def pursuit_counts(
         self, region_of: npt.NDArray[np.int32] | None = None
@@ -158,11 +164,9 @@ def posterior_of(
     model: Model,
     draws: Draws,
     settings: Settings,
+    sampling: Sampling,
 ) -> Posterior:
     """The posterior that draws (chain, draw, N) of a model stand for."""
-    traces = (draws.log_joint, draws.partition_count, *np.moveaxis(draws.parameters, -1, 0))
-    rhats = [value for value in map(rhat, traces) if value is not None]
-    sizes = [value for value in map(effective_sample_size, traces) if value is not None]
     return Posterior(
         candidates=candidates,
         demonstration=demonstration,
@@ -170,9 +174,18 @@ def posterior_of(
         mode=mode_of(model, draws),
         settings=settings,
         model=model,
-        rhat=max(rhats, default=None),
-        ess=min(sizes, default=None),
+        sampling=sampling,
+        convergence=convergence_in(draws, demonstration, candidates),
     )
+
+
+def convergence_in(
+    draws: Draws, demonstration: Demonstration, candidates: Candidates
+) -> Convergence:
+    """How far the chains agree of which these are the draws (chain, draw, N)."""
+    names = list(PRIORS)[: draws.parameters.shape[-1]]  # none, or all of them
+    subgoals = candidates.coordinates.tolist()
+    return convergence_of(traces_of(draws, demonstration.starts, subgoals, names))
 
 
 def infer(
@@ -185,8 +198,8 @@ def infer(
 ) -> Posterior:
     """Sample the posterior of a demonstration's subgoals with fresh chains from the seed.
 
-    Equal demonstrations, maps and settings give equal posteriors, bit for bit: this is what
-    `bnirl infer` and the node's `~/infer` run.
+    Equal demonstrations, maps and settings give equal posteriors, bit for bit, unless time runs
+    out: this is what `bnirl infer` and the node's `~/infer` run.
 
     Args:
         demonstration: observations on free cells of the map.
@@ -203,5 +216,9 @@ def infer(
     if len(demonstration) == 0:
         raise InputError("there is no observation to infer from; a pose and an action make one")
     candidates, model = model_of(demonstration, grid_map, settings)
-    draws = run_chains(model, settings, progress, stop, threads)
-    return posterior_of(candidates, demonstration, model, draws, settings)
+
+    def is_enough(draws: Draws) -> bool:
+        return convergence_in(draws, demonstration, candidates).reached
+
+    draws, sampling = run_until(is_enough, model, settings, progress, stop, threads)
+    return posterior_of(candidates, demonstration, model, draws, settings, sampling)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from bnirl_ros.demonstrations.placement import Placement
+from bnirl_ros.inference.chains import CONVERGED, SWEEP_LIMIT, TIME_BUDGET, Sampling
 from bnirl_ros.inference.draws import Draws
 from bnirl_ros.inference.posterior import Posterior, model_of, posterior_of
 from bnirl_ros.inference.samplers import sampler_of
@@ -15,8 +18,8 @@ from bnirl_ros.inference.settings import Settings
 from bnirl_ros.maps.grid_map import GridMap
 from bnirl_ros.threads import workers
 
-CAPACITY = 128
-"""Draws kept of each chain; even, and enough for R-hat to tell 1.05 from 1."""
+CAPACITY = 256
+"""Draws kept of each of four chains or more; even, and enough to tell that they have converged."""
 
 
 class RunningPosterior:
@@ -48,9 +51,13 @@ class RunningPosterior:
         """
         self.placement, self.grid_map, self.settings = placement, grid_map, settings
         self.sweeps = 0
+        self._seconds = 0.0
+        self._converged, self._next_look = False, settings.sweeps
         self._candidates, self._model = model_of(placement.demonstration, grid_map, settings)
         self._sampler = sampler_of(self._model)
-        self._draws = self._sampler.room_for(self._model, (settings.chains, CAPACITY))
+        self._capacity = CAPACITY * max(1, 4 // settings.chains)
+        room = (settings.chains, self._capacity)
+        self._draws = self._sampler.room_for(self._model, room)
         self._kept, self._thin = 0, 1
         self._generators: list[np.random.Generator]
         self._states: list[Any]
@@ -70,17 +77,28 @@ class RunningPosterior:
 
     @property
     def finished(self) -> bool:
-        """Whether there were as many sweeps as the settings ask for."""
-        return self.sweeps >= self.settings.sweeps
+        """Whether the settings ask for no more sweeps."""
+        return self._stopped is not None
+
+    @property
+    def _stopped(self) -> str | None:
+        """What stopped the chains, as far as these observations are concerned."""
+        settings = self.settings
+        if self._converged:
+            return CONVERGED
+        if self.sweeps >= max(settings.sweeps, settings.max_sweeps):
+            return SWEEP_LIMIT
+        out_of_time = 0.0 < settings.time_budget <= self._seconds
+        return TIME_BUDGET if out_of_time and self._kept else None
 
     def advance(self, draws: int) -> None:
         """Go on for so many further draws of each chain, or fewer where room is short."""
-        if self._kept == CAPACITY:
-            for values in vars(self._draws).values():
-                values[:, : CAPACITY // 2] = values[:, 1::2].copy()
+        if self._kept == self._capacity:
+            self._draws.drop_every_second()
             self._kept //= 2
             self._thin *= 2
-        end = min(self._kept + draws, CAPACITY)
+        end = min(self._kept + draws, self._capacity)
+        begin = time.monotonic()
 
         def run_chain(chain: int) -> None:
             part = self._draws[chain][self._kept : end]
@@ -91,14 +109,27 @@ class RunningPosterior:
             list(threads.map(run_chain, range(len(self._states))))
         self.sweeps += (end - self._kept) * self._thin
         self._kept = end
+        self._seconds += time.monotonic() - begin
 
     def posterior(self) -> Posterior:
         """The posterior from all draws but the first quarter, in which the chains settle."""
-        kept = slice(self._kept // 4, self._kept)
-        draws = Draws(*(values[:, kept] for values in vars(self._draws).values()))
-        return posterior_of(
-            self._candidates, self.placement.demonstration, self._model, draws, self.settings
+        left_out = self._kept // 4
+        draws = Draws(*(values[:, left_out : self._kept] for values in vars(self._draws).values()))
+        burn_in = left_out * self._thin
+        sampling = Sampling(self.sweeps, burn_in, self._thin, self._stopped, self._seconds)
+        posterior = posterior_of(
+            self._candidates,
+            self.placement.demonstration,
+            self._model,
+            draws,
+            self.settings,
+            sampling,
         )
+        # As rarely as offline: who looks often enough sees every chain converge.
+        if self.settings.max_sweeps and self.sweeps >= self._next_look:
+            self._next_look = 2 * self.sweeps
+            self._converged = posterior.convergence.reached
+        return replace(posterior, sampling=replace(sampling, stopped=self._stopped))
 
     def _states_going_on(self, before: RunningPosterior) -> list[Any]:
         """The states of the chains before, over the present observations and candidates."""

@@ -73,6 +73,18 @@ class Settings:
     sweeps: int = setting(1000, "sweeps of each chain, burn-in included", lowest=1)
     burn_in: int = setting(200, "first sweeps of each chain that are left out", lowest=0)
     thin: int = setting(1, "every how many sweeps a draw is kept", lowest=1)
+    max_sweeps: int = setting(
+        0,
+        "sweeps go on, twice as many each time, until the chains have converged, or up to so "
+        "many; 0: no more than sweeps",
+        lowest=0,
+    )
+    time_budget: float = setting(
+        0.0,
+        "time after which sweeping ends in any case [s]; results then depend on the machine; 0: "
+        "no limit",
+        lowest=0.0,
+    )
     chains: int = setting(4, "number of independent chains", lowest=1, highest=1000)
     seed: int = setting(0, "seed of the random numbers", lowest=0)
     success: float = setting(
@@ -99,6 +111,19 @@ class Settings:
             raise InputError(
                 f"sweeps must leave a draw: {self.sweeps} sweeps less {self.burn_in} of burn-in "
                 f"hold none at thin {self.thin}"
+            )
+        if self.max_sweeps:
+            self._refuse_what_cannot_converge()
+
+    def _refuse_what_cannot_converge(self) -> None:
+        if self.max_sweeps < self.sweeps:
+            raise InputError(
+                f"max_sweeps must be 0 or at least sweeps, {self.sweeps}, not {self.max_sweeps}"
+            )
+        if self.chains < 2:
+            raise InputError(
+                "chains must be at least 2 with max_sweeps: one alone cannot tell whether it has "
+                "converged"
             )
 
     def _refuse_what_the_paper_does_not_know(self) -> None:

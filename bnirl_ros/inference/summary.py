@@ -11,6 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from bnirl_ros.demonstrations.demonstration import Demonstration
+from bnirl_ros.inference.chains import Sampling
+from bnirl_ros.inference.convergence import NOTHING_DRAWN, Convergence
 from bnirl_ros.inference.posterior import Posterior, grid_world
 from bnirl_ros.inference.runs import runs
 from bnirl_ros.maps.grid_map import GridMap
@@ -97,10 +99,8 @@ class Summary:
         rank_of: (N,) int64: rank of the subgoal to which the mode assigns each observation; 0 for
             an unexplained one.
         cell_probability: (height, width) float64: posterior probability that a cell is a subgoal.
-        rhat: split R-hat, the largest one of log joint, number of partitions and inferred
-            parameters; None where it is undefined (one chain, or no variance).
-        ess: effective sample size, the smallest one of the same; None where undefined.
-        chains, draws: number of chains, and of draws kept in each.
+        convergence: how far the chains agree.
+        sampling: how many sweeps there were, and what stopped them; None without observations.
         pursuits: those of the mode, in the order of the observations; empty for a model that
             knows none.
         repetitions: how often the pursuits go round the visit sequence, the last time perhaps not
@@ -116,10 +116,8 @@ class Summary:
     observations: npt.NDArray[np.int64]
     rank_of: npt.NDArray[np.int64]
     cell_probability: npt.NDArray[np.float64]
-    rhat: float | None
-    ess: float | None
-    chains: int
-    draws: int
+    convergence: Convergence
+    sampling: Sampling | None
     pursuits: tuple[Pursuit, ...] = ()
     repetitions: int = 0
     unexplained: float = 0.0
@@ -127,6 +125,26 @@ class Summary:
     rank_of_candidate: npt.NDArray[np.int64] = field(
         default_factory=lambda: np.empty(0, dtype=np.int64)
     )
+
+    @property
+    def rhat(self) -> float | None:
+        """The largest split R-hat of all that is watched; None where undefined."""
+        return self.convergence.rhat
+
+    @property
+    def ess(self) -> float | None:
+        """The smallest effective sample size of all that is watched; None where undefined."""
+        return self.convergence.ess
+
+    @property
+    def chains(self) -> int:
+        """Number of chains."""
+        return self.convergence.chains
+
+    @property
+    def draws(self) -> int:
+        """Number of draws kept in each chain."""
+        return self.convergence.draws
 
 
 def summarise(posterior: Posterior, grid_map: GridMap) -> Summary:
@@ -197,10 +215,8 @@ def summarise(posterior: Posterior, grid_map: GridMap) -> Summary:
         observations=demonstration.observations,
         rank_of=rank_of,
         cell_probability=cell_probability,
-        rhat=posterior.rhat,
-        ess=posterior.ess,
-        chains=len(posterior.draws),
-        draws=posterior.draws.log_joint.shape[1],
+        convergence=posterior.convergence,
+        sampling=posterior.sampling,
         pursuits=tuple(sequence) if in_sequence else (),
         repetitions=_repetitions(visits) if in_sequence else 0,
         unexplained=float((posterior.draws.subgoal_of < 0).mean()),
@@ -339,10 +355,8 @@ def nothing_found(grid_map: GridMap) -> Summary:
         observations=np.empty((0, 4), dtype=np.int64),
         rank_of=np.empty(0, dtype=np.int64),
         cell_probability=np.zeros(grid_map.free.shape),
-        rhat=None,
-        ess=None,
-        chains=0,
-        draws=0,
+        convergence=NOTHING_DRAWN,
+        sampling=None,
     )
 
 

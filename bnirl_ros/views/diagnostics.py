@@ -50,8 +50,16 @@ def inference_values(
         "sweeps": str(sweeps),
         "R-hat": _number(summary.rhat if summary else None),
         "effective sample size": _number(summary.ess if summary else None),
+        "converged": _converged(summary),
         "queue": str(waiting),
     }
+
+
+def _converged(summary: Summary | None) -> str:
+    """Whether the chains have, and if not, why not."""
+    if summary is None:
+        return "no"
+    return f"no: {summary.convergence.doubt}" if summary.convergence.doubt else "yes"
 
 
 def diagnostic_array(name: str, health: Health, stamp_ns: int) -> DiagnosticArray:

@@ -31,7 +31,7 @@ from bnirl_ros.model.pursuits import PRIORS
 from bnirl_ros.views.colours import Colour, colour_of, writing_on
 from bnirl_ros.views.map_panel import ARROW, DistinctPairs, distinct_pairs
 from bnirl_ros.views.pursuits import knows_pursuits, unexplained_share
-from bnirl_ros.views.tables import interval_of, known, subgoal_columns, what_of
+from bnirl_ros.views.tables import after, interval_of, known, subgoal_columns, what_of
 from bnirl_ros.views.ways import route_of
 
 _MOST_OTHERS = 2000
@@ -43,8 +43,8 @@ _LEAST = 0.005
 _MOST_DRAWS = 1000
 """Draws of each chain that a trace shows: of more, every second or third and so on."""
 
-_AGREE, _NEARLY_AGREE = 1.01, 1.05
-"""R-hat up to which chains are said to; the first is that of Vehtari et al. (2021)."""
+_NEARLY_AGREE = 1.05
+"""R-hat above which chains are said not to agree before all else."""
 
 _MOST_NAMES = 3
 """Demonstrations that a title names: more are counted."""
@@ -233,15 +233,17 @@ def _convergence(summary: Summary) -> str:
             f"{drawn}. R-hat is undefined, which it is for one chain or draws that are all the "
             "same; take more chains to see whether they agree."
         )
-    worst = f"the worst R-hat is {summary.rhat:.3f}"
-    if summary.rhat <= _AGREE:
-        return f"{drawn}: {worst}, so they agree."
-    if summary.rhat <= _NEARLY_AGREE:
-        return f"{drawn}: {worst}, so they nearly agree; more sweeps would make it more exact."
-    return (
-        f"{drawn}: {worst}, so they do not agree yet and probabilities may be off; infer again "
-        "with more sweeps."
-    )
+    agreed = summary.convergence
+    worst = f"the worst R-hat is {summary.rhat:.3f}, of {agreed.rhat_of}"
+    if summary.ess is not None:
+        worst += f", and the smallest effective sample size {summary.ess:,.0f}, of {agreed.ess_of}"
+    when = f" {after(summary.sampling)}" if summary.sampling else ""
+    if agreed.reached:
+        return f"{drawn}: {worst}. They have converged{when}."
+    doubt = "more sweeps would make it more exact"
+    if summary.rhat > _NEARLY_AGREE:
+        doubt = "probabilities may be off; infer again with more sweeps"
+    return f"{drawn}: {worst}. They have not converged{when}: {doubt}."
 
 
 def _trace_rows(traces: Sequence[Mapping[str, Any]]) -> str:

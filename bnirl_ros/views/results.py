@@ -121,7 +121,8 @@ def subgoals_document(summary: Summary, grid_map: GridMap, settings: Settings) -
     A model that knows pursuits adds to each subgoal the expected number of its `pursuits`, and
     below `visit_sequence` how often the pursuits go round it (`repetitions`, 0 for no loop), the
     pursuits of each of the `episodes`, from `first` to `last` by rows of `observations` in
-    posterior.npz, and the expected share of `unexplained` observations. `parameters` are there
+    posterior.npz, and the expected share of `unexplained` observations. `diagnostics` tell what
+    `stopped` the sweeps and whether the chains have `converged`. `parameters` are there
     where the summary tells them, with median and central 90 % of the posterior. A feature subgoal
     has its coordinates as `feature`, all its `cells`, the `name` of the feature if it has one, and
     no single `cell`.
@@ -159,7 +160,23 @@ def subgoals_document(summary: Summary, grid_map: GridMap, settings: Settings) -
             "ess": finite(summary.ess),
             "chains": summary.chains,
             "draws": summary.draws,
+            **_sampling(summary),
         },
+    }
+
+
+def _sampling(summary: Summary) -> dict[str, Any]:
+    """What the document tells of how the draws came about, and whether they suffice."""
+    if summary.sampling is None:
+        return {}
+    return {
+        "sweeps": summary.sampling.sweeps,
+        "burn_in": summary.sampling.burn_in,
+        "thin": summary.sampling.thin,
+        "stopped": summary.sampling.stopped,
+        "converged": summary.convergence.reached,
+        "rhat_of": summary.convergence.rhat_of,
+        "ess_of": summary.convergence.ess_of,
     }
 
 

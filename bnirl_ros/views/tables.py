@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from bnirl_ros.bags.topics import Topic
+from bnirl_ros.inference.chains import TIME_BUDGET, Sampling
+from bnirl_ros.inference.convergence import Convergence
 from bnirl_ros.inference.summary import Parameter, Subgoal, Summary
 from bnirl_ros.views.pursuits import knows_pursuits, unexplained_share
 
@@ -13,7 +15,7 @@ def report(summary: Summary) -> str:
     """All that a summary tells on the terminal, line by line; no newline at the end.
 
     Above all the subgoals, then slips, loop and parameters where the model knows them, and last
-    how far the chains agree.
+    how far the chains agree and whether that is enough.
     """
     lines = [subgoal_table(summary.subgoals, summary.visit_sequence)]
     if summary.repetitions > 1:
@@ -22,7 +24,10 @@ def report(summary: Summary) -> str:
         lines.append(f"unexplained: {unexplained_share(summary)} of the observations")
     if summary.parameters:
         lines.append(parameter_table(summary.parameters))
-    return "\n".join([*lines, convergence(summary)])
+    lines.append(convergence(summary))
+    if summary.sampling:
+        lines.append(verdict(summary.convergence, summary.sampling))
+    return "\n".join(lines)
 
 
 def subgoal_table(subgoals: Sequence[Subgoal], visit_sequence: Sequence[int]) -> str:
@@ -120,6 +125,24 @@ def convergence(summary: Summary) -> str:
         f"draws, R-hat {known(summary.rhat, '.3f')}, effective sample size "
         f"{known(summary.ess, '.0f')}"
     )
+
+
+def verdict(agreed: Convergence, sampling: Sampling) -> str:
+    """One line on whether the chains have converged and what stopped them; if not, what to do."""
+    if agreed.reached:
+        return f"the chains have converged {after(sampling)}"
+    remedy = f"--max-sweeps {16 * sampling.sweeps} goes on until they have"
+    if agreed.chains < 2:
+        remedy = "take --chains 4"
+    elif sampling.stopped == TIME_BUDGET:
+        remedy = "raise --time-budget"
+    return f"the chains have not converged {after(sampling)}: {agreed.doubt}; {remedy}"
+
+
+def after(sampling: Sampling) -> str:
+    """After how many sweeps, and whether time ran out."""
+    budget = ", where the time budget was used up" * (sampling.stopped == TIME_BUDGET)
+    return f"after {sampling.sweeps:,} sweeps{budget}"
 
 
 def known(value: float | None, form: str) -> str:
