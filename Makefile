@@ -70,6 +70,7 @@ benchmark: venv  ## Time the main job and its parts, the node under load, replay
 	$(BIN)/python benchmarks/replay.py
 	$(BIN)/python benchmarks/large_bag.py
 	$(BIN)/python benchmarks/goal_values.py
+	$(BIN)/python benchmarks/convergence.py
 
 campaigns: venv  ## Damage bags in thousands of ways, and see what is read of them
 	$(BIN)/python -m bnirl_ros.experiments.damage $(CAMPAIGN_ARGS) bags $(wildcard $(BAGS))

@@ -163,6 +163,14 @@ def test_subgoals_json_is_the_contract(run: Run) -> None:
     assert document["diagnostics"]["draws"] == 800
     assert 0.99 < document["diagnostics"]["rhat"] < 1.05
     assert 100 < document["diagnostics"]["ess"] <= 4000
+    told = {name: document["diagnostics"][name] for name in ("sweeps", "burn_in", "thin")}
+    assert told == {"sweeps": 1000, "burn_in": 200, "thin": 1}
+    assert document["diagnostics"]["stopped"] == "sweep limit"
+    agreed = document["diagnostics"]["rhat"] <= 1.01 and document["diagnostics"]["ess"] >= 400
+    assert document["diagnostics"]["converged"] == agreed
+    verdict = "the chains have converged after" if agreed else "the chains have not converged"
+    assert verdict in run.end.out
+    assert re.search(r"^1,000 sweeps took .* s: .* effective samples a second", run.end.out, re.M)
 
     subgoals = document["subgoals"]
     check_subgoals(document, arrays)
@@ -754,6 +762,33 @@ def test_wrong_arguments_end_with_status_2(
     assert end.err.startswith("usage: bnirl")
 
 
+def test_chains_go_on_until_they_have_converged_or_time_is_up(
+    bnirl: Command, walk_bag: Path, tmp_path: Path
+) -> None:
+    few = ["infer", walk_bag, "--model", "paper", "--sweeps", "40", "--burn-in", "10"]
+    end = bnirl(*few, "--out", tmp_path / "few")
+    assert "the chains have not converged after 40 sweeps: " in end.out
+    assert "; --max-sweeps 640 goes on until they have\n" in end.out
+    assert not document_in(tmp_path / "few")["diagnostics"]["converged"]
+
+    end = bnirl(*few, "--max-sweeps", "100000", "--report", "--out", tmp_path / "on")
+    told = document_in(tmp_path / "on")["diagnostics"]
+    assert (told["stopped"], told["converged"]) == ("converged", True)
+    assert f"the chains have converged after {told['sweeps']:,} sweeps\n" in end.out
+    page = (tmp_path / "on" / "report.html").read_text(encoding="utf-8")
+    assert f"They have converged after {told['sweeps']:,} sweeps." in page
+    same = [f"--{name.replace('_', '-')}={told[name]}" for name in ("sweeps", "burn_in", "thin")]
+    bnirl(*few, *same, "--out", tmp_path / "at_once")
+    at_once, on = (arrays_in(tmp_path / name) for name in ("at_once", "on"))
+    for name, values in at_once.items():
+        assert np.array_equal(values, on[name]), name
+
+    end = bnirl(*few, "--time-budget", "1e-9", "--out", tmp_path / "hurried")
+    assert "where the time budget was used up: 4 draws are too few to tell; raise" in end.out
+    told = document_in(tmp_path / "hurried")["diagnostics"]
+    assert (told["stopped"], told["sweeps"], told["rhat"]) == ("time budget", 1, None)
+
+
 def test_a_csv_needs_a_map(bnirl: Command, tmp_path: Path) -> None:
     (tmp_path / "demo.csv").write_text("episode,x,y,action\n0,0,0,E\n")
     end = bnirl("infer", tmp_path / "demo.csv")
@@ -925,7 +960,7 @@ def test_of_many_cells_the_terminal_shows_the_first_ones(
     assert end.status == 0
     assert len(foreseen_in(tmp_path)) == MAP.free.sum() == 48
     assert end.out.splitlines()[21] == "and 28 cells more"
-    assert len(end.out.splitlines()) == 24
+    assert len(end.out.splitlines()) == 25
 
 
 def test_with_four_moves_five_actions_are_foreseen(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from threading import Event
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -183,9 +184,16 @@ def convergence_in(
     draws: Draws, demonstration: Demonstration, candidates: Candidates
 ) -> Convergence:
     """How far the chains agree of which these are the draws (chain, draw, N)."""
+    return convergence_of(watched_in(draws, demonstration, candidates))
+
+
+def watched_in(
+    draws: Draws, demonstration: Demonstration, candidates: Candidates
+) -> dict[str, npt.NDArray[Any]]:
+    """What is watched of the chains of which these are the draws: `traces_of`."""
     names = list(PRIORS)[: draws.parameters.shape[-1]]  # none, or all of them
     subgoals = candidates.coordinates.tolist()
-    return convergence_of(traces_of(draws, demonstration.starts, subgoals, names))
+    return traces_of(draws, demonstration.starts, subgoals, names)
 
 
 def infer(

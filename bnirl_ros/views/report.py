@@ -21,7 +21,7 @@ import numpy.typing as npt
 from bnirl_ros import __version__
 from bnirl_ros.bags.sources import STANDARD_INPUT
 from bnirl_ros.inference.diagnostics import effective_sample_size, rhat
-from bnirl_ros.inference.posterior import Posterior
+from bnirl_ros.inference.posterior import Posterior, watched_in
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.inference.summary import Subgoal, Summary, middle_of
 from bnirl_ros.limits import limits_of
@@ -230,8 +230,8 @@ def _convergence(summary: Summary) -> str:
     drawn = f"{_many(summary.chains, 'chain')} of {_many(summary.draws, 'draw')}"
     if summary.rhat is None:
         return (
-            f"{drawn}. R-hat is undefined, which it is for one chain or draws that are all the "
-            "same; take more chains to see whether they agree."
+            f"{drawn}. R-hat is undefined, which it is for one chain, a few draws, or all the "
+            "same ones; take more to see whether they agree."
         )
     agreed = summary.convergence
     worst = f"the worst R-hat is {summary.rhat:.3f}, of {agreed.rhat_of}"
@@ -459,6 +459,10 @@ def _traces(posterior: Posterior, counts: npt.NDArray[np.int64]) -> list[dict[st
             for column, name in enumerate(PRIORS)
             if name not in posterior.settings.fixed
         }
+    watched = watched_in(draws, posterior.demonstration, posterior.candidates)
+    for name in (posterior.convergence.rhat_of, posterior.convergence.ess_of):
+        if "subgoal" in name:  # the others are there already
+            quantities[name.removeprefix("the ")] = watched[name].astype(np.int64)
     every = max(1, math.ceil(draws.log_joint.shape[1] / _MOST_DRAWS))
     return [
         {
