@@ -27,7 +27,7 @@ from bnirl_ros.inference.settings import Settings
 from bnirl_ros.maps.grid_map import GridMap
 from bnirl_ros.resources import share_folder
 
-BAGS = ("paper_loop", "turtle_waypoints", "overcooked_random3")
+BAGS = ("paper_loop", "turtle_waypoints")
 MODELS = ("sequential", "paper")
 SWEEPS, BURN_IN, MAX_SWEEPS = 200, 50, 51_200
 LONG = 20_000  # sweeps to compare with

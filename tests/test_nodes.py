@@ -312,6 +312,11 @@ def test_the_papers_model_tells_no_intent(subgoals: Callable[..., Subgoals]) -> 
     node.until_shown(CORNER_PLACES)
     assert not node.outputs["current_subgoal"]
     assert not node.outputs["intent"]
+    # It goes on until the chains have converged, if that is asked for.
+    assert all(each.successful for each in node.set(max_sweeps=1_000_000))
+    node.peer.until(lambda: node.health()["converged"] == "yes", "chains that have converged")
+    node.until_settled(OBSERVATIONS_OF_WALK)
+    assert int(node.health()["sweeps"]) < 1_000_000
     # Another model, and back: what it told is taken away.
     assert all(each.successful for each in node.set(model="sequential"))
     node.peer.until(lambda: node.outputs["intent"], "an intent")
