@@ -30,7 +30,7 @@ from bnirl_ros.resources import share_folder
 BAGS = ("paper_loop", "turtle_waypoints")
 MODELS = ("sequential", "paper")
 SWEEPS, BURN_IN, MAX_SWEEPS = 200, 50, 51_200
-LONG = 20_000  # sweeps to compare with
+LONG = 10_000  # sweeps to compare with
 ERROR_BOUND = 0.1  # four standard errors
 SHARE_BOUND = 0.02  # of the converged inferences may be off by more than that
 
