@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import label
 from scipy.sparse import csr_array
 
 from bnirl_ros.mdp import reward_values
@@ -14,6 +15,7 @@ from bnirl_ros.mdp.finite_mdp import FiniteMDP
 from bnirl_ros.mdp.goal_values import goal_values
 from bnirl_ros.mdp.goals import Goals
 from bnirl_ros.mdp.grid_world import GridWorld
+from bnirl_ros.mdp.parts import connected_parts
 from reference import grid_transitions, optimal_values
 
 
@@ -29,6 +31,12 @@ def grid_worlds(draw: st.DrawFn) -> GridWorld:
         success=draw(st.floats(0.01, 1.0)),
         discount=draw(st.floats(0.0, 0.99)),
     )
+
+
+@given(grid_worlds())
+def test_parts_of_a_map_are_scipys(world: GridWorld) -> None:
+    parts, _ = label(world.free)
+    np.testing.assert_array_equal(connected_parts(world.free), parts)
 
 
 @settings(max_examples=60)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 from bnirl_ros.cli.inference import (
@@ -50,7 +50,6 @@ def _infer(options: argparse.Namespace) -> int:
         return infer_many(options, settings, remappings)
 
     from bnirl_ros.inference.summary import summarise
-    from bnirl_ros.views.map_panel import import_matplotlib
     from bnirl_ros.views.report import title_of
     from bnirl_ros.views.results import check_writable, write_results
     from bnirl_ros.views.tables import report
@@ -58,12 +57,14 @@ def _infer(options: argparse.Namespace) -> int:
     (options.demonstration,) = options.demonstrations
     demonstration, grid_map, damage = read(options, settings, remappings)
     check_writable(options.out)
-    Thread(target=import_matplotlib, daemon=True).start()  # while the chains leave the GIL alone
     posterior = inferred(demonstration, grid_map, settings)
     summary = summarise(posterior, grid_map)
     title = title_of(options.demonstrations) if options.report else None
-    written = write_results(options.out, posterior, summary, grid_map, settings, title)
-    print(report(summary))
-    print_rate(posterior)
+    try:  # first what was found: to import what draws the picture takes longer than to infer
+        print(report(summary))
+        print_rate(posterior)
+        sys.stdout.flush()
+    finally:  # also where nobody reads on
+        written = write_results(options.out, posterior, summary, grid_map, settings, title)
     print(f"Written: {', '.join(str(file) for file in written)}")
     return told_of(damage)

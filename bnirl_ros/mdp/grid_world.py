@@ -12,6 +12,7 @@ from numba import njit
 
 from bnirl_ros.mdp.actions import ACTION_SETS, STEPS
 from bnirl_ros.mdp.first_passage import Motion, first_passage_values
+from bnirl_ros.mdp.parts import connected_parts
 from bnirl_ros.mdp.process import first_passage_by_sweeps
 from bnirl_ros.mdp.wave import DIAGONAL, STRAIGHT
 
@@ -107,11 +108,7 @@ class GridWorld:
 
     @cached_property
     def _part_of_state(self) -> npt.NDArray[np.int32]:
-        """(S,) diagonal moves need both cells beside them, so moves to the sides tell parts."""
-        from scipy.ndimage import label  # here, since only this needs it
-
-        parts, _ = label(self.free)
-        return np.asarray(parts.reshape(-1), dtype=np.int32)
+        return np.asarray(connected_parts(self.free).reshape(-1))
 
     def places_of(self, states: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """(U, 2) where each state lies: its cell."""

@@ -61,7 +61,7 @@ def distinct_pairs(
 def import_matplotlib() -> tuple[Any, Any]:
     """matplotlib's Figure and FigureCanvasAgg, imported when first asked for.
 
-    That takes longer than most inferences, so that a caller may want to have it done meanwhile.
+    That takes longer than most inferences: what else there is to tell is told before.
     pyplot is left alone: it would keep every figure, and may look for a screen.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
