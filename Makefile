@@ -66,6 +66,8 @@ reference: venv  ## Write docs/reference.md, the topics and parameters of the no
 benchmark: venv  ## Time the main job and its parts, the node under load, replay, and goal values
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[benchmark]'
 	$(BIN)/python benchmarks/main_job.py
+	$(BIN)/python benchmarks/start_up.py
+	$(BIN)/python benchmarks/running.py
 	$(BIN)/python benchmarks/load.py
 	$(BIN)/python benchmarks/replay.py
 	$(BIN)/python benchmarks/large_bag.py

@@ -118,7 +118,8 @@ def episode_starts(
         episode_gap: [s].
     """
     elapsed = np.diff(stamps)
-    apart = np.abs(np.diff(cells, axis=0)).max(axis=1, initial=0) > 1
+    steps = np.diff(cells, axis=0)
+    apart = (np.abs(steps[:, 0]) > 1) | (np.abs(steps[:, 1]) > 1)
     ends = (elapsed < 0) | (elapsed > episode_gap * 1e9) | apart
     return np.concatenate([np.ones(min(len(stamps), 1), dtype=bool), ends])
 

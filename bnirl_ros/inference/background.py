@@ -24,6 +24,7 @@ from bnirl_ros.maps.grid_map import GridMap
 # that the time is spent on sweeps.
 _FIRST_ROUND = 0.1
 _ROUND = 1.0
+_DRAWS = 4  # of each chain, between two looks at whether something has changed
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,13 +213,24 @@ class BackgroundInference(Worker):
             if len(placement.demonstration) == 0:
                 self._running = None
                 return Result(grid_map, placement, None, 0)
-            self._running = RunningPosterior(placement, grid_map, settings, self._running)
+            before = self._running
+            self._running = RunningPosterior(placement, grid_map, settings, before)
+            # At once, but for chains that would never get to sweep if all goes on changing.
+            if self._running.ready and before and before.sweeps:
+                return self._running_result()
         running = self._running
+        if not running.sweeps:
+            running.prepare()
         end = time.monotonic() + (_ROUND if running.sweeps else _FIRST_ROUND)
         while True:
-            running.advance(4)
+            running.advance(_DRAWS)
             if self._changed or running.finished or time.monotonic() > end:
                 break
+        return self._running_result()
+
+    def _running_result(self) -> Result:
+        running = self._running
+        assert running is not None
         return self._result_of(running.posterior(), running.grid_map, running.placement)
 
     def _result_of(self, posterior: Posterior, grid_map: GridMap, placement: Placement) -> Result:

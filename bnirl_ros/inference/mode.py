@@ -91,6 +91,28 @@ def ascend(
     return max(modes, key=lambda mode: mode.log_joint)
 
 
+def extended(mixture: SubgoalMixture, subgoal_of: npt.NDArray[np.int32]) -> Mode:
+    """The mode of a demonstration that has grown, from that of before.
+
+    Of the mode that `ascend` finds, where one subgoal has one partition. Each new observation goes
+    where (10) gains most, one after the other; the others stay.
+
+    Args:
+        mixture: the model now.
+        subgoal_of: (N before,) candidate index, among those now, of what the mode was.
+    """
+    seated = np.bincount(subgoal_of, minlength=len(mixture.log_prior))
+    chosen = list(subgoal_of.tolist())
+    for pair in mixture.pair_of[len(subgoal_of) :]:
+        by_size = np.log(np.maximum(seated, 1))
+        place = np.where(seated > 0, by_size, math.log(mixture.eta) + mixture.log_prior)
+        best = int((place + mixture.log_likelihood[pair]).argmax())
+        seated[best] += 1
+        chosen.append(best)
+    subgoals = np.array(chosen, dtype=np.int64)
+    return _mode(mixture, subgoals, np.arange(len(mixture.log_prior)))
+
+
 def _mode(
     mixture: SubgoalMixture,
     partition_of: npt.NDArray[np.int64],

@@ -15,15 +15,17 @@ from bnirl_ros.inference import mode, pursuit_mode
 from bnirl_ros.inference.chains import Progress, Sampling, run_until
 from bnirl_ros.inference.convergence import Convergence, convergence_of, traces_of
 from bnirl_ros.inference.draws import Draws
+from bnirl_ros.inference.known_goals import KnownGoals
 from bnirl_ros.inference.mode import Mode
 from bnirl_ros.inference.runs import run_counts
 from bnirl_ros.inference.samplers import Model
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.maps.grid_map import GridMap
+from bnirl_ros.mdp.distinct import distinct
 from bnirl_ros.mdp.grid_world import GridWorld
 from bnirl_ros.model.candidates import Candidates, candidates_of
-from bnirl_ros.model.mixture import SubgoalMixture, subgoal_mixture
-from bnirl_ros.model.pursuits import PRIORS, PursuitModel, pursuit_model
+from bnirl_ros.model.mixture import SubgoalMixture, log_policies, subgoal_mixture
+from bnirl_ros.model.pursuits import PRIORS, PursuitModel, action_costs, pursuit_model
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +54,9 @@ class Posterior:
 
     @property
     def ess_per_second(self) -> float | None:
-        """Effective samples for each second of sampling [1/s]; it depends on the machine."""
-        ess = self.convergence.ess
-        return None if ess is None else ess / self.sampling.seconds
+        """Effective samples for each second of sampling [1/s], if any; the machine's doing."""
+        ess, seconds = self.convergence.ess, self.sampling.seconds
+        return None if ess is None or not seconds else ess / seconds
 
     def pursuit_counts(
         self, region_of: npt.NDArray[np.int32] | None = None
@@ -91,15 +93,34 @@ def grid_world(grid_map: GridMap, settings: Settings) -> GridWorld:
     return GridWorld(grid_map.free, settings.moves, settings.success, settings.discount)
 
 
+def known_goals(grid_map: GridMap, settings: Settings) -> KnownGoals:
+    """What is to be known from one `model_of` to the next, on this map and with these settings."""
+    world = grid_world(grid_map, settings)
+    if settings.model == "paper":
+        alpha = settings.fixed["alpha"]
+        return KnownGoals(world, lambda states, goals: log_policies(world, states, goals, alpha))
+    likelihood = settings.likelihood
+    return KnownGoals(world, lambda states, goals: action_costs(world, states, goals, likelihood))
+
+
 def model_of(
-    demonstration: Demonstration, grid_map: GridMap, settings: Settings
+    demonstration: Demonstration,
+    grid_map: GridMap,
+    settings: Settings,
+    known: KnownGoals | None = None,
 ) -> tuple[Candidates, Model]:
     """The candidates, and the model over them that the settings ask for.
+
+    Args:
+        demonstration: the observations.
+        grid_map: the map.
+        settings: model and sampling settings.
+        known: `known_goals` of the same map and settings, which are made use of, and added to.
 
     Raises:
         InputError: the map has features, but where they are needed it has none.
     """
-    world = grid_world(grid_map, settings)
+    world = known.world if known else grid_world(grid_map, settings)
     candidates = candidates_of(
         settings.candidates,
         demonstration,
@@ -113,9 +134,10 @@ def model_of(
             world.states_of(demonstration.cells),
             demonstration.action,
             candidates.goals,
+            policies_in=known.of if known else None,
             **settings.fixed,
         )
-    return candidates, pursuit_model_of(demonstration, candidates, grid_map, settings)
+    return candidates, pursuit_model_of(demonstration, candidates, grid_map, settings, known)
 
 
 def pursuit_model_of(
@@ -123,15 +145,16 @@ def pursuit_model_of(
     candidates: Candidates,
     grid_map: GridMap,
     settings: Settings,
+    known: KnownGoals | None = None,
 ) -> PursuitModel:
-    """The sequential model of a demonstration over given candidates.
+    """The sequential model of a demonstration over given candidates; `known` as in `model_of`.
 
     Raises:
         InputError: some of it lies where no candidate can be reached.
     """
-    world = grid_world(grid_map, settings)
+    world = known.world if known else grid_world(grid_map, settings)
     states = world.states_of(demonstration.cells)
-    visited = np.unique(states)
+    visited, _ = distinct(states, world.state_count)
     reachable = candidates.reachable_from(world, visited)
     if not reachable.all():
         x, y = world.cells_of(visited[~reachable])[0]
@@ -149,6 +172,7 @@ def pursuit_model_of(
         arrived=candidates.reached_in(world, world.cells_of(visited), radius),
         likelihood=settings.likelihood,
         fixed=settings.fixed,
+        cost=known.of(visited, candidates.goals) if known else None,
     )
 
 

@@ -27,6 +27,7 @@ from numba import njit
 
 from bnirl_ros.inference.draws import Draws
 from bnirl_ros.inference.kernels import categorical, count_draws, number_in_order
+from bnirl_ros.mdp.distinct import distinct
 from bnirl_ros.model.pursuits import (
     ALPHA,
     AT_SUBGOAL,
@@ -111,7 +112,8 @@ class KernelModel(NamedTuple):
 def kernel_model(model: PursuitModel) -> KernelModel:
     """A model in the form that the kernels of sampler, mode and filter take."""
     actions = model.cost.shape[1]
-    pairs, pair_of = np.unique(model.state_of * actions + model.action_of, return_inverse=True)
+    keys = model.state_of * actions + model.action_of
+    pairs, pair_of = distinct(keys, len(model.cost) * actions)
     return KernelModel(
         cost=model.cost,
         state_of=model.state_of,
@@ -122,7 +124,7 @@ def kernel_model(model: PursuitModel) -> KernelModel:
         place=model.place,
         prior=model.prior,
         uniform=model.uniform,
-        pair_of=pair_of.astype(np.int64),
+        pair_of=pair_of,
         pair_state=pairs // actions,
         pair_action=pairs % actions,
         near_first=np.concatenate([[0], np.cumsum(model.arrived.sum(axis=1))]).astype(np.int64),

@@ -8,6 +8,7 @@ Viterbi algorithm, all pursuits of one subgoal at once, and subgoals of few purs
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +33,7 @@ from bnirl_ros.inference.pursuit_gibbs import (
     urn_ratio,
     urn_weights,
 )
+from bnirl_ros.mdp.distinct import distinct
 from bnirl_ros.model.pursuits import ALPHA, ELSEWHERE, ETA, PRIORS, PursuitModel
 from bnirl_ros.threads import workers
 
@@ -79,7 +81,60 @@ def ascend(
         np.where(model.starts & (given < 0), _next_known(given, model), given)
     )
     state = state_of(model, subgoals, model.starts, parameters)
-    value, slipped = _ascend(kernel_model(model), state)
+    return _mode(subgoals, *_ascend(kernel_model(model), state))
+
+
+def extended(
+    model: PursuitModel,
+    subgoal_of: npt.NDArray[np.int32],
+    parameters: npt.NDArray[np.float64],
+) -> Mode:
+    """The mode of a demonstration that has grown, from that of before.
+
+    Only the last observations of the last episode are given other subgoals than before: the best
+    path through the new ones and some of those before them.
+
+    Args:
+        model: the model now.
+        subgoal_of: (N before,) candidate index, among those now, of what the mode was; -1 for a
+            slip.
+        parameters: in the order of `PRIORS`.
+    """
+    count, known = len(model.state_of), len(subgoal_of)
+    given = np.concatenate([subgoal_of, np.full(count - known, -1, dtype=np.int32)])
+    subgoals = filled_forward(
+        np.where(model.starts & (given < 0), _next_known(given, model), given)
+    )
+    state = state_of(model, subgoals, model.starts, parameters)
+    # One more before the block tells where it comes from, and stays as it is.
+    first = max(known - int(_BLOCKS[1]), 0)
+    end = replace(
+        model,
+        state_of=model.state_of[first:],
+        action_of=model.action_of[first:],
+        starts=np.append(True, model.starts[first + 1 :]),
+    )
+    _improve_end(
+        kernel_model(end),
+        state._replace(subgoal_of=subgoals[first:], switched=state.switched[first:]),
+        np.int64(0 if model.starts[first] else 1),
+    )
+    # Candidates that are pursued nowhere make no difference to the joint.
+    used, narrow = distinct(subgoals, len(model.prior))
+    narrowed = replace(
+        model,
+        cost=model.cost[:, :, used],
+        arrived=model.arrived[:, used],
+        candidate_part=model.candidate_part[used],
+        place=model.place[used],
+    )
+    state = state._replace(subgoal_of=narrow.astype(np.int32), counts=state.counts[used])
+    kernel = kernel_model(narrowed)._replace(prior=model.prior[used])
+    return _mode(subgoals, *_joint_and_slips(kernel, state))
+
+
+def _mode(subgoals: npt.NDArray[np.int32], value: float, slipped: npt.NDArray[np.bool_]) -> Mode:
+    """From subgoals (N,), the log joint, and which observations are slips."""
     labels, first, number = np.unique(
         np.where(slipped, -1, subgoals), return_index=True, return_inverse=True
     )
@@ -129,12 +184,33 @@ def _ascend(model, state):  # type: ignore[no-untyped-def]
                 _restore(state, subgoal_of, switched)
         if gained:
             value = _climb(model, state, chosen, likely)
+    return value, _slips(model, state, chosen)
+
+
+@njit(nogil=True, cache=True)
+def _improve_end(model, state, first):  # type: ignore[no-untyped-def]
+    """The best paths through the observations from `first` on, episode by episode."""
+    chosen = softmax_table(model, state.parameters[ALPHA])
+    likely = log_likelihood_table(model, state.parameters, chosen)
+    _improve_from(model, state, likely, first, _BLOCKS[0], _NONE, _NONE)
+
+
+@njit(nogil=True, cache=True)
+def _joint_and_slips(model, state):  # type: ignore[no-untyped-def]
+    """The log joint, and (N,) which actions are more probably slips than not."""
+    chosen = softmax_table(model, state.parameters[ALPHA])
+    return log_joint_of(model, state, chosen), _slips(model, state, chosen)
+
+
+@njit(nogil=True, cache=True)
+def _slips(model, state, chosen):  # type: ignore[no-untyped-def]
+    """(N,) which actions are more probably slips than not."""
     count = state.subgoal_of.shape[0]
     slipped = np.empty(count, dtype=np.bool_)
     for t in range(count):
         total = likelihood(model, state.parameters, chosen, t, state.subgoal_of[t])
         slipped[t] = unexplained(model, state.parameters, t) > 0.5 * total
-    return value, slipped
+    return slipped
 
 
 @njit(nogil=True, cache=True)
@@ -192,8 +268,13 @@ def _improve_blocks(model, state, likely, length, concerned, forbidden):  # type
     With a candidate `concerned`, only through the blocks where it occurs; if it is `forbidden`,
     the best path without it.
     """
+    _improve_from(model, state, likely, np.int64(0), length, concerned, forbidden)
+
+
+@njit(nogil=True, cache=True)
+def _improve_from(model, state, likely, first, length, concerned, forbidden):  # type: ignore[no-untyped-def]
+    """As `_improve_blocks`, but what comes before `first` stays as it is."""
     count = model.starts.shape[0]
-    first = np.int64(0)
     while first < count:
         end = first + 1
         while end < count and end - first < length and not model.starts[end]:

@@ -74,8 +74,8 @@ class GridMap:
         """Which of the cells (N, 2) lie on the map."""
         cells = np.asarray(cells, dtype=np.int64).reshape(-1, 2)
         height, width = self.free.shape
-        inside = (cells >= 0) & (cells < (width, height))
-        return np.asarray(inside.all(axis=1))
+        x, y = cells[:, 0], cells[:, 1]
+        return np.asarray((x >= 0) & (x < width) & (y >= 0) & (y < height))
 
     def is_free(self, cells: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Which of the cells (N, 2) lie on the map and are free."""

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
+from bnirl_ros.mdp.distinct import distinct
 from bnirl_ros.mdp.goal_values import goal_values
 from bnirl_ros.mdp.goals import Goals
-from bnirl_ros.mdp.process import MarkovDecisionProcess
+from bnirl_ros.mdp.process import MarkovDecisionProcess, checked_states
 from bnirl_ros.model.likelihood import action_columns, action_log_likelihood
 
 
@@ -79,6 +81,7 @@ def subgoal_mixture(
     candidates: npt.ArrayLike | Goals,
     alpha: float,
     eta: float,
+    policies_in: Callable[[npt.NDArray[np.int64], Goals], npt.NDArray[np.float64]] | None = None,
 ) -> SubgoalMixture:
     """The paper's model of a demonstration: likelihood (7), P(g) uniform over the candidates.
 
@@ -89,19 +92,31 @@ def subgoal_mixture(
         candidates: the goals in the support of P(g), or (G,) state numbers of single ones.
         alpha: confidence; above 0.
         eta: concentration; above 0.
+        policies_in: what tells the `log_policies` of goals in states, ascending, where they are
+            known; by default they are found, which takes most of the time.
 
     Raises:
         InputError: there is no such action.
     """
     goals = candidates if isinstance(candidates, Goals) else Goals.of_states(candidates)
-    visited, state_index = np.unique(np.asarray(states), return_inverse=True)
-    position = action_columns(mdp, actions)
-    pairs, pair_of = np.unique(state_index * len(mdp.actions) + position, return_inverse=True)
-    values = goal_values(mdp, goals, visited)
-    by_pair = action_log_likelihood(values, alpha).reshape(-1, len(goals))
+    visited, state_of = distinct(checked_states(mdp, states, "state"), mdp.state_count)
+    action_count = len(mdp.actions)
+    keys = state_of * action_count + action_columns(mdp, actions)
+    pairs, pair_of = distinct(keys, len(visited) * action_count)
+    policies = (
+        policies_in(visited, goals) if policies_in else log_policies(mdp, visited, goals, alpha)
+    )
+    by_pair = policies.reshape(-1, len(goals))
     return SubgoalMixture(
         log_likelihood=np.ascontiguousarray(by_pair[pairs]),
-        pair_of=pair_of.astype(np.int64),
+        pair_of=pair_of,
         log_prior=np.full(len(goals), -np.log(len(goals))),
         eta=eta,
     )
+
+
+def log_policies(
+    mdp: MarkovDecisionProcess, states: npt.NDArray[np.int64], goals: Goals, alpha: float
+) -> npt.NDArray[np.float64]:
+    """(U, A, G) log P(a | s, g), equation (7), in each of the states (U,)."""
+    return action_log_likelihood(goal_values(mdp, goals, states), alpha)

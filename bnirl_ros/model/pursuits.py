@@ -20,9 +20,10 @@ import numpy as np
 import numpy.typing as npt
 
 from bnirl_ros.errors import InputError
+from bnirl_ros.mdp.distinct import distinct
 from bnirl_ros.mdp.goal_values import goal_values
 from bnirl_ros.mdp.goals import Goals
-from bnirl_ros.mdp.process import MarkovDecisionProcess
+from bnirl_ros.mdp.process import MarkovDecisionProcess, checked_states
 from bnirl_ros.model.likelihood import action_columns, delays, value_losses
 
 _VALUE_TOLERANCE = 1e-8  # far below what the likelihood can tell, also of ratios far away
@@ -231,7 +232,7 @@ def pursuit_model(
         ValueError: a candidate lies in more than one part of the map.
     """
     goals = candidates if isinstance(candidates, Goals) else Goals.of_states(candidates)
-    visited, state_of = np.unique(np.asarray(states, dtype=np.int64), return_inverse=True)
+    visited, state_of = distinct(checked_states(mdp, states, "state"), mdp.state_count)
     action_of = action_columns(mdp, actions)
     parts = np.unique(
         np.concatenate([mdp.parts_of(visited), mdp.parts_of(goals.states)]), return_inverse=True
@@ -249,7 +250,7 @@ def pursuit_model(
         priors["alpha"] = VALUE_ALPHA
     return PursuitModel(
         cost=action_costs(mdp, visited, goals, likelihood) if cost is None else cost,
-        state_of=state_of.astype(np.int64),
+        state_of=state_of,
         action_of=action_of.astype(np.int64),
         starts=np.asarray(starts, dtype=np.bool_),
         arrived=goals.hold(visited) if arrived is None else arrived,
