@@ -25,6 +25,7 @@ from bnirl_ros.inference.pursuit_gibbs import (
     likelihood,
     log_joint_of,
     log_likelihood_table,
+    log_urns,
     near,
     softmax_table,
     state_of,
@@ -77,9 +78,7 @@ def ascend(
         parameters: in the order of `PRIORS`.
     """
     given = np.asarray(subgoal_of, dtype=np.int32)
-    subgoals = filled_forward(
-        np.where(model.starts & (given < 0), _next_known(given, model), given)
-    )
+    subgoals = _with_slips(model, given)
     state = state_of(model, subgoals, model.starts, parameters)
     return _mode(subgoals, *_ascend(kernel_model(model), state))
 
@@ -102,10 +101,8 @@ def extended(
     """
     count, known = len(model.state_of), len(subgoal_of)
     given = np.concatenate([subgoal_of, np.full(count - known, -1, dtype=np.int32)])
-    subgoals = filled_forward(
-        np.where(model.starts & (given < 0), _next_known(given, model), given)
-    )
-    state = state_of(model, subgoals, model.starts, parameters)
+    state = state_of(model, _with_slips(model, given), model.starts, parameters)
+    subgoals = state.subgoal_of
     # One more before the block tells where it comes from, and stays as it is.
     first = max(known - int(_BLOCKS[1]), 0)
     end = replace(
@@ -144,6 +141,14 @@ def _mode(subgoals: npt.NDArray[np.int32], value: float, slipped: npt.NDArray[np
         partition_of=(np.argsort(np.argsort(first))[number] - slipped.any()).astype(np.int32),
         log_joint=value,
     )
+
+
+def _with_slips(model: PursuitModel, subgoal_of: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+    """(N,) subgoals with those of slips (-1), each taken for part of the pursuit around it."""
+    missing = model.starts & (subgoal_of < 0)
+    if missing.any():
+        subgoal_of = np.where(missing, _next_known(subgoal_of, model), subgoal_of)
+    return filled_forward(subgoal_of)
 
 
 def _next_known(subgoal_of: npt.NDArray[np.int32], model: PursuitModel) -> npt.NDArray[np.int32]:
@@ -197,9 +202,19 @@ def _improve_end(model, state, first):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True)
 def _joint_and_slips(model, state):  # type: ignore[no-untyped-def]
-    """The log joint, and (N,) which actions are more probably slips than not."""
+    """As `log_joint_of`, with few candidates, and (N,) which actions are more probably slips."""
     chosen = softmax_table(model, state.parameters[ALPHA])
-    return log_joint_of(model, state, chosen), _slips(model, state, chosen)
+    likely = log_likelihood_table(model, state.parameters, chosen)
+    total, rho_before, kept, left = 0.0, -1.0, 0.0, 0.0
+    for t in range(state.subgoal_of.shape[0]):
+        total += likely[model.pair_of[t], state.subgoal_of[t]]
+        if not model.starts[t]:
+            rho = switch_probability(model, state.parameters, t, state.subgoal_of[t - 1])
+            if rho != rho_before:
+                rho_before, kept, left = rho, floored_log(1.0 - rho), floored_log(rho)
+            total += left if state.switched[t] else kept
+    total += log_urns(model, state.parameters[ETA], state.counts)
+    return total, _slips(model, state, chosen)
 
 
 @njit(nogil=True, cache=True)
