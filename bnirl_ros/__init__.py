@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
+# Before anything imports a kernel.
+import_module(f"{__name__}.kernel_cache").ensure_kernel_cache()
+
 __all__ = [
     "Demonstration",
     "FeatureMap",

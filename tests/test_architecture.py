@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "bnirl_ros"
 
 # Rooms of one row see each other and those of all rows before; see docs/architecture.md.
 ORDER = [
-    {"errors", "limits", "resources", "threads"},
+    {"errors", "kernel_cache", "limits", "resources", "threads"},
     {"mdp"},
     {"maps"},
     {"demonstrations"},
