@@ -12,8 +12,9 @@ import pytest
 from bnirl_ros.demonstrations.placement import Placement, place
 from bnirl_ros.demonstrations.recording import Recorder
 from bnirl_ros.errors import InputError
-from bnirl_ros.inference import background
+from bnirl_ros.inference import background, pursuit_mode
 from bnirl_ros.inference.background import BackgroundInference, Result
+from bnirl_ros.inference.particles import chosen_again
 from bnirl_ros.inference.posterior import infer
 from bnirl_ros.inference.running import CAPACITY, RunningPosterior
 from bnirl_ros.inference.settings import Settings
@@ -281,3 +282,68 @@ def test_closing_does_not_wait_for_the_end_of_an_inference() -> None:
         time.sleep(0.01)
     worker.close()
     assert request.cancelled()
+
+
+def grown(model: str, **settings: float) -> tuple[RunningPosterior, RunningPosterior]:
+    """A posterior whose chains have swept, and the next one, with a new episode to a new cell."""
+    recorder = recorded(3)
+    chosen = replace(SETTINGS, model=model, **settings)
+    before = finished(RunningPosterior(place(recorder.snapshot(), MAP), MAP, chosen))
+    before.advance(1)
+    before.posterior()
+    before.prepare()
+    record_round(recorder, 3, ((0, 0), (6, 0), (6, 3), (5, 4)))
+    return before, RunningPosterior(place(recorder.snapshot(), MAP), MAP, chosen, before)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_new_observations_are_in_the_posterior_before_a_sweep(model: str) -> None:
+    before, after = grown(model)
+    assert after.ready
+    assert after.sweeps == 0
+    posterior = after.posterior()
+    assert len(posterior.demonstration) == len(after.placement.poses) > len(before.placement.poses)
+    assert len(posterior.candidates) == len(before.posterior().candidates) + 1
+    fresh = infer(after.placement.demonstration, MAP, after.settings)
+    np.testing.assert_array_equal(posterior.mode.subgoal_of, fresh.mode.subgoal_of)
+    if model == "sequential":  # the joint of the mode is that of the sampler's kernels
+        again = pursuit_mode.ascend(after._model, posterior.mode.subgoal_of, after._middle)
+        assert posterior.mode.log_joint == pytest.approx(again.log_joint)
+    # 32 draws: probabilities known to some 0.1 at worst
+    np.testing.assert_allclose(
+        posterior.subgoal_probability(), fresh.subgoal_probability(), atol=0.5
+    )
+    after.advance(40)
+    assert after.posterior().draws.subgoal_of.shape[:2] == (4, 30)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_draws_that_took_in_observations_have_the_joint_of_the_model(model: str) -> None:
+    _, after = grown(model, **({} if model == "paper" else {"slip": 0.0}))
+    particles = after._particles
+    assert particles is not None
+    draws, pairs = particles.draws, after._model
+    for row in range(len(draws)):
+        subgoal_of, partition_of = draws.subgoal_of[row], draws.partition_of[row]
+        if model == "paper":
+            _, first = np.unique(partition_of, return_index=True)
+            expected = pairs.log_joint(partition_of, subgoal_of[first])
+        else:
+            expected = pairs.log_joint(subgoal_of, particles.switched[row], draws.parameters[row])
+            counts = np.bincount(
+                subgoal_of[particles.switched[row]], minlength=len(after._candidates)
+            )
+            np.testing.assert_array_equal(particles.counts[row], counts)
+        assert draws.log_joint[row] == pytest.approx(expected)
+        _, order = np.unique(partition_of, return_index=True)
+        np.testing.assert_array_equal(partition_of[np.sort(order)], np.arange(len(order)))
+
+
+def test_draws_are_chosen_again_as_often_as_their_weights_say() -> None:
+    weights = np.array([0.1, 0.4, 0.0, 0.5])
+    generator = np.random.default_rng(0)
+    chosen = np.array([chosen_again(weights, generator) for _ in range(2000)])
+    times = np.stack([(chosen == parent).sum(axis=1) for parent in range(4)], axis=1)
+    np.testing.assert_allclose(times.mean(axis=0), 4 * weights, atol=0.05)
+    assert (np.abs(times - 4 * weights) < 1.0).all()
+    assert (chosen[:, 3] == 3).all()  # who is chosen stays where it is
