@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bnirl_ros.inference import pursuit_gibbs, pursuit_mode
+from bnirl_ros.inference.kernels import exponentials, row_sum
 from bnirl_ros.inference.runs import run_counts, runs
 from bnirl_ros.mdp.actions import STEPS
 from bnirl_ros.mdp.finite_mdp import FiniteMDP
@@ -110,6 +111,7 @@ def test_the_filter_is_the_one_over_all_pairs_of_subgoals(seed: int) -> None:
             pursuit_gibbs.forward_pass(
                 kernel, parameters, chosen, weights, low, high, before, *pieces
             )
+            pieces[0][:] /= pieces[1][:, None]
             before = pieces[0][-1] if high > low else before
         belief = weights
         for t in range(first, end):
@@ -144,6 +146,53 @@ def test_ascent_finds_the_largest_of_every_history() -> None:
         assert mode.log_joint <= best + 1e-8
         found += mode.log_joint >= best - 1e-8
     assert found >= 0.97 * cases
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_scores_of_partitions_are_sums_of_logarithms(seed: int) -> None:
+    # A confidence up to 1,000: products of what is next to impossible must not run out of digits.
+    generator = np.random.default_rng(seed)
+    model = random_model(seed, count=200)
+    parameters = parameters_drawn(model, generator)
+    parameters[pursuit_gibbs.ALPHA] = 10.0 ** generator.uniform(-1.0, 3.0)
+    parameters[pursuit_gibbs.SLIP] = generator.choice([0.0, parameters[pursuit_gibbs.SLIP]])
+    kernel = pursuit_gibbs.kernel_model(model)
+    chosen = pursuit_gibbs.softmax_table(kernel, parameters[pursuit_gibbs.ALPHA])
+    part = model.state_part[model.state_of]
+    groups, partition_of = np.unique(
+        2 * part + generator.integers(2, size=len(part)), return_inverse=True
+    )
+    here = np.array([np.flatnonzero(model.candidate_part == p)[0] for p in part], dtype=np.int32)
+    state = pursuit_gibbs.state_of(model, here, model.starts, parameters)
+    state.partition_of[:] = partition_of
+    scores = pursuit_gibbs.group_scores(kernel, state, chosen, np.int64(len(groups)))
+
+    explained = (1.0 - parameters[pursuit_gibbs.SLIP]) * chosen[kernel.pair_of]
+    slips = parameters[pursuit_gibbs.SLIP] * model.uniform[model.state_of]
+    each = np.log(explained + slips[:, np.newaxis])
+    usual = parameters[pursuit_gibbs.ELSEWHERE]
+    floor = 1e-300
+    for t in np.flatnonzero(~model.starts):
+        for candidate in np.flatnonzero(model.arrived[model.state_of[t]]):
+            rho = switch_probability(model, parameters, t, int(candidate))
+            odds = (rho, usual) if state.switched[t] else (1.0 - rho, 1.0 - usual)
+            gain = np.log(np.maximum(odds, floor))
+            each[t - 1, candidate] += gain[0] - gain[1]
+    for group in range(len(groups)):
+        members = partition_of == group
+        expected = each[members].sum(axis=0) + np.log(model.prior)
+        expected[model.candidate_part != part[members][0]] = -np.inf
+        np.testing.assert_allclose(scores[group], expected, rtol=1e-10, atol=1e-10)
+
+
+@given(st.lists(st.floats(0.0, 1e6) | st.just(np.inf), max_size=600), st.floats(1e-3, 1e3))
+def test_exponentials_are_those_of_the_library(values: list[float], factor: float) -> None:
+    given_values = np.array(values, dtype=np.float64)
+    found, scratch = np.empty_like(given_values), np.empty_like(given_values)
+    exponentials(given_values, -factor, found, scratch)
+    expected = np.exp(np.maximum(-factor * given_values, -700.0))
+    np.testing.assert_allclose(found, expected, rtol=2e-14)
+    assert row_sum(found) == pytest.approx(expected.sum(), rel=1e-12)
 
 
 @given(st.lists(st.tuples(st.integers(-1, 3), st.booleans()), max_size=30))

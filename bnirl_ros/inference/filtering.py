@@ -77,7 +77,7 @@ def _filtered(
             belief[first:end],
             evidence[first:end],
         )
-    return belief, evidence
+    return belief / evidence[:, np.newaxis], evidence
 
 
 def foreseen(
@@ -345,6 +345,7 @@ class SubgoalFilter:
         )
         kernel = kernel_model(model)
         belief = np.empty((len(states) - first, len(drawn)))
+        evidence = np.empty(len(belief))
         forward_pass(
             kernel,
             self._parameters,
@@ -354,8 +355,9 @@ class SubgoalFilter:
             len(states),
             before,
             belief,
-            np.empty(len(belief)),
+            evidence,
         )
+        belief /= evidence[:, np.newaxis]
         self._belief, self._drawn, self._state = belief[-1].copy(), drawn, int(states[-1])
         return belief
 

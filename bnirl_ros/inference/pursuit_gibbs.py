@@ -26,7 +26,13 @@ import numpy.typing as npt
 from numba import njit
 
 from bnirl_ros.inference.draws import Draws
-from bnirl_ros.inference.kernels import categorical, count_draws, number_in_order
+from bnirl_ros.inference.kernels import (
+    categorical,
+    count_draws,
+    exponentials,
+    number_in_order,
+    row_sum,
+)
 from bnirl_ros.mdp.distinct import distinct
 from bnirl_ros.model.pursuits import (
     ALPHA,
@@ -42,10 +48,12 @@ from bnirl_ros.model.pursuits import (
 _SHORTEST_BLOCK, _LONGEST_BLOCK = 8, 1024  # observations; their logarithm is uniform
 _BLOCK_ENTRIES = 4_000_000  # of the forward messages: shorter blocks where candidates are many
 _SLICE = 0.7  # first width of a slice, of a logarithm
-_CONFIDENCE_PERIOD = 4  # sweeps between two draws of alpha, where those cost more than the rest
+_OVERHEAD = 400  # candidates for which an observation takes as long as for what is done once
 _RELOCATED = 4000  # observations, beyond which a subgoal is relocated less than once in a sweep
 _RELOCATIONS = 4  # in a sweep over few observations
 _HEAVY = 1e-6  # a weight above which a candidate's place matters to a relocation
+_LN_2 = math.log(2.0)
+_FRACTION, _ONE = np.int64((1 << 52) - 1), np.int64(1023 << 52)  # bits of a float64
 _FARTHEST = 27.0  # logarithms and logits are not sought beyond
 
 LEAST_PROBABILITY = 1e-200
@@ -82,6 +90,7 @@ class KernelModel(NamedTuple):
             there.
         pair_of: (N,) number k of each observation's distinct (state, action) pair.
         pair_state, pair_action: (K,) the pairs.
+        by_pair: (N,) the observations in the order of their pairs.
         near_first: (U + 1,) `near[near_first[u] : near_first[u + 1]]` are the candidates at which
             state u counts as having arrived.
         near: (M,).
@@ -102,6 +111,7 @@ class KernelModel(NamedTuple):
     pair_of: npt.NDArray[np.int64]
     pair_state: npt.NDArray[np.int64]
     pair_action: npt.NDArray[np.int64]
+    by_pair: npt.NDArray[np.int64]
     near_first: npt.NDArray[np.int64]
     near: npt.NDArray[np.int64]
     is_fixed: npt.NDArray[np.bool_]
@@ -127,6 +137,7 @@ def kernel_model(model: PursuitModel) -> KernelModel:
         pair_of=pair_of,
         pair_state=pairs // actions,
         pair_action=pairs % actions,
+        by_pair=np.argsort(pair_of, kind="stable").astype(np.int64),
         near_first=np.concatenate([[0], np.cumsum(model.arrived.sum(axis=1))]).astype(np.int64),
         near=np.nonzero(model.arrived)[1].astype(np.int64),
         is_fixed=np.array([name in model.fixed for name in PRIORS]),
@@ -237,19 +248,35 @@ def advance(
     generators give equal draws.
     """
     arrays = (draws.subgoal_of, draws.partition_of, draws.log_joint, draws.parameters)
-    _advance(kernel_model(model), state, generator, thin, *arrays)
+    kernel = kernel_model(model)
+    candidates = len(kernel.prior)
+    longest = max(_SHORTEST_BLOCK, min(_LONGEST_BLOCK, _BLOCK_ENTRIES // candidates))
+    # Numpy asks for large pages, which numba does not.
+    table = np.empty((len(kernel.pair_state), candidates))
+    _advance(kernel, state, generator, thin, table, np.empty((longest, candidates)), *arrays)
 
 
 @njit(nogil=True, cache=True)
-def _advance(model, state, generator, thin, subgoal_of, partition_of, log_joint, parameters):  # type: ignore[no-untyped-def]
-    candidates = model.prior.shape[0]
-    longest = max(_SHORTEST_BLOCK, min(_LONGEST_BLOCK, _BLOCK_ENTRIES // candidates))
-    forward = np.empty((longest, candidates))
-    chosen = softmax_table(model, state.parameters[ALPHA])
+def _advance(  # type: ignore[no-untyped-def]
+    model,
+    state,
+    generator,
+    thin,
+    chosen,
+    forward,
+    subgoal_of,
+    partition_of,
+    log_joint,
+    parameters,
+):
+    """`chosen` (K, G) and `forward` (block, G) are room for the softmax table and a block."""
+    _fill_softmax_table(model, state.parameters[ALPHA], chosen)
     scratch = np.empty(state.subgoal_of.shape[0], dtype=np.int32)
-    # A draw of alpha takes a new table, an exponential for each of its states and actions.
-    states, actions = model.cost.shape[:2]
-    period = 1 if states * actions <= scratch.shape[0] else _CONFIDENCE_PERIOD
+    # A draw of alpha takes a new table, an exponential for each cost: it comes round so rarely
+    # that this is less than half of all work. What an observation takes besides its candidates
+    # counts as `_OVERHEAD` of them.
+    work = scratch.shape[0] * (model.prior.shape[0] + _OVERHEAD)
+    period = 1 + 2 * model.cost.size // work
     relocation_period = 1 + scratch.shape[0] // _RELOCATED
     relocations = min(1 + _RELOCATED // (1 + scratch.shape[0]), _RELOCATIONS)
     for draw in range(log_joint.shape[0]):
@@ -266,7 +293,7 @@ def _advance(model, state, generator, thin, subgoal_of, partition_of, log_joint,
             confidence_too = state.sweeps[0] % period == 0
             _draw_action_parameters(model, state, chosen, confidence_too, generator)
             if confidence_too and not model.is_fixed[ALPHA]:
-                chosen = softmax_table(model, state.parameters[ALPHA])
+                _fill_softmax_table(model, state.parameters[ALPHA], chosen)
             # For the record only, but in every sweep: thinning chooses sweeps of the same chain.
             _draw_slips(model, state, chosen, generator)
             state.sweeps[0] += 1
@@ -280,36 +307,54 @@ def _advance(model, state, generator, thin, subgoal_of, partition_of, log_joint,
 @njit(nogil=True, cache=True)
 def softmax_table(model, alpha):  # type: ignore[no-untyped-def]
     """(K, G) probability of each pair's action by the softmax, slips left out."""
-    actions, candidates = model.cost.shape[1:]
-    table = np.empty((model.pair_state.shape[0], candidates))
-    total = np.empty(candidates)
-    before = -1
-    for pair in range(table.shape[0]):
-        state = model.pair_state[pair]
-        if state != before:
-            total[:] = 0.0
-            for action in range(actions):
-                total += np.exp(-alpha * model.cost[state, action])
-            before = state
-        cost = model.cost[state, model.pair_action[pair]]
-        table[pair] = np.maximum(np.exp(-alpha * cost) / total, LEAST_PROBABILITY)
+    table = np.empty((model.pair_state.shape[0], model.prior.shape[0]))
+    _fill_softmax_table(model, alpha, table)
     return table
 
 
 @njit(nogil=True, cache=True)
+def _fill_softmax_table(model, alpha, table):  # type: ignore[no-untyped-def]
+    states, actions, candidates = model.cost.shape
+    unobserved, total, scratch = np.empty(candidates), np.empty(candidates), np.empty(candidates)
+    first = end = 0  # of the pairs of a state, which are in the order of their actions
+    for state in range(states):
+        first = end
+        total[:] = 0.0
+        for action in range(actions):
+            row = unobserved
+            if (
+                end < table.shape[0]
+                and model.pair_state[end] == state
+                and model.pair_action[end] == action
+            ):
+                row = table[end]
+                end += 1
+            exponentials(model.cost[state, action], -alpha, row, scratch)
+            for candidate in range(candidates):
+                total[candidate] += row[candidate]
+        for candidate in range(candidates):
+            total[candidate] = 1.0 / total[candidate]
+        for pair in range(first, end):
+            row = table[pair]
+            for candidate in range(candidates):
+                share = row[candidate] * total[candidate]
+                row[candidate] = share if share > LEAST_PROBABILITY else LEAST_PROBABILITY
+
+
+@njit(nogil=True, cache=True, inline="always")
 def likelihood(model, parameters, chosen, t, candidate):  # type: ignore[no-untyped-def]
     """P(a_t | s_t, g), slips included."""
     explained = (1.0 - parameters[SLIP]) * chosen[model.pair_of[t], candidate]
     return explained + unexplained(model, parameters, t)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, inline="always")
 def unexplained(model, parameters, t):  # type: ignore[no-untyped-def]
     """The part of a slip in P(a_t | s_t, g)."""
     return parameters[SLIP] * model.uniform[model.state_of[t]]
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, inline="always")
 def _place(model, t, candidate):  # type: ignore[no-untyped-def]
     """0 on arrival at the candidate, 1 where there already, 2 elsewhere."""
     if not model.arrived[model.state_of[t], candidate]:
@@ -317,7 +362,7 @@ def _place(model, t, candidate):  # type: ignore[no-untyped-def]
     return 1 if model.arrived[model.state_of[t - 1], candidate] else 0
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, inline="always")
 def switch_probability(model, parameters, t, candidate):  # type: ignore[no-untyped-def]
     """Rho before observation t, which begins no episode, where `candidate` was pursued."""
     return parameters[ON_ARRIVAL + _place(model, t, candidate)]
@@ -326,76 +371,88 @@ def switch_probability(model, parameters, t, candidate):  # type: ignore[no-unty
 @njit(nogil=True, cache=True)
 def urn_weights(model, eta, counts, part):  # type: ignore[no-untyped-def]
     """(G,) probability that the next draw in a part of the map is each candidate."""
+    candidate_part, prior = model.candidate_part, model.prior
+    scale = 1.0 / (eta + _drawn(candidate_part, counts, part))
+    weights = np.empty(counts.shape[0])
+    for candidate in range(weights.shape[0]):
+        weight = (eta * prior[candidate] + counts[candidate]) * scale
+        weights[candidate] = weight if candidate_part[candidate] == part else 0.0
+    return weights
+
+
+@njit(nogil=True, cache=True)
+def _drawn(candidate_part, counts, part):  # type: ignore[no-untyped-def]
+    """Number of draws in a part of the map."""
     drawn = 0
     for candidate in range(counts.shape[0]):
-        if model.candidate_part[candidate] == part:
-            drawn += counts[candidate]
-    weights = np.zeros(counts.shape[0])
-    for candidate in range(counts.shape[0]):
-        if model.candidate_part[candidate] == part:
-            weights[candidate] = eta * model.prior[candidate] + counts[candidate]
-    return weights / (eta + drawn)
+        drawn += counts[candidate] if candidate_part[candidate] == part else 0
+    return drawn
 
 
 @njit(nogil=True, cache=True)
 def forward_pass(model, parameters, chosen, weights, first, end, before, forward, evidence):  # type: ignore[no-untyped-def]
     """Filter observations `first` to `end` of one episode.
 
-    Fills forward[i] (G,) with P(theta_t | actions up to t), t = first + i, and evidence[i] with
-    the probability of action t given those before it. `before` (G,) is the same for first - 1; it
-    is not read where `first` begins the episode.
+    Fills evidence[i] with the probability of action t = first + i given those before it, and
+    forward[i] (G,) with P(theta_t, action t | actions before t): the filter times the evidence.
+    `before` (G,) is the filter at first - 1; where `first` begins the episode it is of no effect.
     """
-    state_of, pair_of, uniform = model.state_of, model.pair_of, model.uniform
+    starts, state_of, pair_of, uniform = model.starts, model.state_of, model.pair_of, model.uniform
     arrived, near_first, near = model.arrived, model.near_first, model.near
     candidates = weights.shape[0]
     on_arrival, at_subgoal = parameters[ON_ARRIVAL], parameters[AT_SUBGOAL]
     elsewhere = parameters[ELSEWHERE]
     explained = 1.0 - parameters[SLIP]
+    before = before.copy()
+    of_near = np.empty(candidates)
+    scale = 1.0
     for t in range(first, end):
         state = state_of[t]
         likely = chosen[pair_of[t]]
         unexplained = parameters[SLIP] * uniform[state]
+        keep, switch = 0.0, 1.0
+        here = near[:0]
+        if not starts[t]:
+            keep, switch = (1.0 - elsewhere) * scale, elsewhere
+            here = near[near_first[state] : near_first[state + 1]]
+            # Candidates at which the demonstrator has arrived are kept by a probability of their
+            # own: they are taken out of the many, and added when these are done.
+            for index in range(here.shape[0]):
+                candidate = here[index]
+                rho = at_subgoal if arrived[state_of[t - 1], candidate] else on_arrival
+                of_near[index] = before[candidate]
+                switch += before[candidate] * scale * (rho - elsewhere)
+                before[candidate] = 0.0
         after = forward[t - first]
-        if model.starts[t]:
-            for candidate in range(candidates):
-                after[candidate] = weights[candidate]
-        else:
-            switch = elsewhere
-            for index in range(near_first[state], near_first[state + 1]):
-                candidate = near[index]
-                rho = at_subgoal if arrived[state_of[t - 1], candidate] else on_arrival
-                switch += before[candidate] * (rho - elsewhere)
-            for candidate in range(candidates):
-                kept = before[candidate] * (1.0 - elsewhere)
-                after[candidate] = kept + switch * weights[candidate]
-            for index in range(near_first[state], near_first[state + 1]):
-                candidate = near[index]
-                rho = at_subgoal if arrived[state_of[t - 1], candidate] else on_arrival
-                kept = before[candidate] * (1.0 - rho)
-                after[candidate] = kept + switch * weights[candidate]
-        total = 0.0
         for candidate in range(candidates):
-            value = after[candidate] * (explained * likely[candidate] + unexplained)
-            after[candidate] = value
-            total += value
-        scale = 1.0 / total
-        for candidate in range(candidates):
-            after[candidate] *= scale
+            moved = before[candidate] * keep + switch * weights[candidate]
+            after[candidate] = moved * (explained * likely[candidate] + unexplained)
+        for index in range(here.shape[0]):
+            candidate = here[index]
+            rho = at_subgoal if arrived[state_of[t - 1], candidate] else on_arrival
+            before[candidate] = of_near[index]
+            kept = before[candidate] * scale * (1.0 - rho)
+            after[candidate] += kept * (explained * likely[candidate] + unexplained)
+        total = row_sum(after)
         evidence[t - first] = total
+        scale = 1.0 / total
         before = after
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, inline="always")
 def near(model, t):  # type: ignore[no-untyped-def]
     """Candidates at which the demonstrator counts as having arrived when it chose action t."""
     state = model.state_of[t]
     return model.near[model.near_first[state] : model.near_first[state + 1]]
 
 
-@njit(nogil=True, cache=True)
-def switch_mass(model, parameters, filtered, t):  # type: ignore[no-untyped-def]
-    """Probability of a switch before t, where theta_(t-1) is distributed as `filtered`."""
-    mass = parameters[ELSEWHERE]
+@njit(nogil=True, cache=True, inline="always")
+def switch_mass(model, parameters, filtered, total, t):  # type: ignore[no-untyped-def]
+    """Probability of a switch before t, where theta_(t-1) is distributed as `filtered`.
+
+    Times `total`, to which `filtered` sums up.
+    """
+    mass = parameters[ELSEWHERE] * total
     for candidate in near(model, t):
         rho = switch_probability(model, parameters, t, candidate)
         mass += filtered[candidate] * (rho - parameters[ELSEWHERE])
@@ -463,26 +520,26 @@ def _draw_path(model, parameters, chosen, weights, theta, forward, first, end, g
     if goes_on:
         new_theta[end - first] = theta[end]
     else:
-        new_theta[end - 1 - first] = categorical(forward[end - 1 - first], 1.0, generator)
+        i = end - 1 - first
+        new_theta[i] = categorical(forward[i], evidence[i], generator)
     for t in range(last - 1, first, -1):
         i = t - first
         target = new_theta[i]
         filtered = forward[i - 1]
         rho = switch_probability(model, parameters, t, target)
         kept = filtered[target] * (1.0 - rho)
-        switches = switch_mass(model, parameters, filtered, t) * weights[target]
+        mass = switch_mass(model, parameters, filtered, evidence[i - 1], t)
+        switches = mass * weights[target]
         new_switched[i] = generator.random() * (kept + switches) >= kept
         if new_switched[i]:
-            total = 0.0
+            elsewhere = parameters[ELSEWHERE]
             for candidate in range(candidates):
-                weight[candidate] = filtered[candidate] * parameters[ELSEWHERE]
+                weight[candidate] = filtered[candidate] * elsewhere
             for candidate in near(model, t):
                 weight[candidate] = filtered[candidate] * switch_probability(
                     model, parameters, t, candidate
                 )
-            for candidate in range(candidates):
-                total += weight[candidate]
-            new_theta[i - 1] = categorical(weight, total, generator)
+            new_theta[i - 1] = categorical(weight, row_sum(weight), generator)
         else:
             new_theta[i - 1] = target
     new_switched[0] = True
@@ -499,8 +556,7 @@ def urn_ratio(model, eta, counts, weights, theta, switched):  # type: ignore[no-
 
     `counts` are those without the sequence; they are changed meanwhile.
     """
-    part = -1
-    drawn = 0
+    part = drawn = np.int64(-1)
     ratio = 0.0
     for i in range(theta.shape[0]):
         if not switched[i]:
@@ -508,9 +564,7 @@ def urn_ratio(model, eta, counts, weights, theta, switched):  # type: ignore[no-
         candidate = theta[i]
         if part < 0:
             part = model.candidate_part[candidate]
-            for other in range(counts.shape[0]):
-                if model.candidate_part[other] == part:
-                    drawn += counts[other]
+            drawn = _drawn(model.candidate_part, counts, part)
         probability = (eta * model.prior[candidate] + counts[candidate]) / (eta + drawn)
         ratio += math.log(probability / weights[candidate])
         counts[candidate] += 1
@@ -535,19 +589,15 @@ def _relocate(model, state, chosen, generator):  # type: ignore[no-untyped-def]
     it.
     """
     weights = _draw_weights(model, state, generator)
-    heavy = 0
-    for candidate in range(weights.shape[0]):
-        heavy += weights[candidate] > _HEAVY
-        if state.counts[candidate] > 0 and weights[candidate] <= _HEAVY:
-            return
-    remaining = int(generator.random() * heavy)
-    subgoal = -1
+    # Half of the time by their weights, which go with them: those pursued most come to it soonest.
+    by_weight = generator.random() < 0.5
+    odds = np.zeros(weights.shape[0])
     for candidate in range(weights.shape[0]):
         if weights[candidate] > _HEAVY:
-            if remaining == 0:
-                subgoal = candidate
-                break
-            remaining -= 1
+            odds[candidate] = weights[candidate] if by_weight else 1.0
+        elif state.counts[candidate] > 0:
+            return
+    subgoal = categorical(odds, row_sum(odds), generator)
     left = model.place[subgoal, 0] - int(3.0 * generator.random())
     bottom = model.place[subgoal, 1] - int(3.0 * generator.random())
     part = model.candidate_part[subgoal]
@@ -591,8 +641,8 @@ def _relocate(model, state, chosen, generator):  # type: ignore[no-untyped-def]
                 small, state.parameters, likely, trial, first, end, trial, forward, evidence
             )
             scores[option] += np.log(evidence[: end - first]).sum()
-    odds = np.exp(scores - scores.max())
-    option = categorical(odds, odds.sum(), generator)
+    likely_options = np.exp(scores - scores.max())
+    option = categorical(likely_options, likely_options.sum(), generator)
     for first, end in bounds:
         path, switched = _draw_path(
             small,
@@ -650,6 +700,7 @@ def _restricted(model, candidates):  # type: ignore[no-untyped-def]
         model.pair_of,
         model.pair_state,
         model.pair_action,
+        model.by_pair,
         first,
         near_candidates,
         model.is_fixed,
@@ -666,8 +717,7 @@ def _draw_groups(model, state, chosen, generator):  # type: ignore[no-untyped-de
     eta P(g). P(subgoal | partition): P(g) times the product of all that its observations say.
     """
     groups = _draw_partitions(model, state, generator)
-    likely = log_likelihood_table(model, state.parameters, chosen)
-    scores = group_scores(model, state, likely, groups)
+    scores = group_scores(model, state, chosen, groups)
     subgoal = np.empty(groups, dtype=np.int32)
     for group in range(groups):
         weights = np.exp(scores[group] - scores[group].max())
@@ -721,20 +771,38 @@ def log_likelihood_table(model, parameters, chosen):  # type: ignore[no-untyped-
 
 
 @njit(nogil=True, cache=True)
-def group_scores(model, state, likely, groups):  # type: ignore[no-untyped-def]
+def group_scores(model, state, chosen, groups):  # type: ignore[no-untyped-def]
     """(J, G) log of P(g) times all probabilities in which a partition's subgoal occurs.
 
-    `likely` (K, G) is the `log_likelihood_table`.
+    The probabilities of the actions are multiplied, as a logarithm costs more than ten products.
     """
     parameters, candidates = state.parameters, model.prior.shape[0]
-    pairs = model.pair_state.shape[0]
-    tally = np.zeros((groups, pairs), dtype=np.int32)
     part = np.zeros(groups, dtype=np.int64)
-    scores = np.zeros((groups, candidates))
-    for t in range(state.subgoal_of.shape[0]):
+    products = np.ones((groups, candidates))
+    powers = np.zeros((groups, candidates), dtype=np.int64)  # of two, taken out of the products
+    factors = np.zeros(groups, dtype=np.int64)
+    explained = 1.0 - parameters[SLIP]
+    least = max(explained * LEAST_PROBABILITY, parameters[SLIP] * model.uniform.min())
+    most_factors = max(1, int(math.log(1e-300) / math.log(least)))  # that cannot underflow
+    for t in model.by_pair:  # a row of the table is read once
         group = state.partition_of[t]
-        tally[group, model.pair_of[t]] += 1
         part[group] = model.state_part[model.state_of[t]]
+        by_slip = parameters[SLIP] * model.uniform[model.state_of[t]]
+        product, likely = products[group], chosen[model.pair_of[t]]
+        for candidate in range(candidates):
+            product[candidate] *= explained * likely[candidate] + by_slip
+        factors[group] += 1
+        if factors[group] % most_factors == 0:
+            _take_out_powers(product, powers[group])
+    scores = np.empty((groups, candidates))
+    for group in range(groups):
+        for candidate in range(candidates):
+            if model.candidate_part[candidate] == part[group]:
+                score = math.log(products[group, candidate] * model.prior[candidate])
+                scores[group, candidate] = score + powers[group, candidate] * _LN_2
+            else:
+                scores[group, candidate] = -np.inf
+    for t in range(state.subgoal_of.shape[0]):
         if model.starts[t]:
             continue
         group = state.partition_of[t - 1]
@@ -746,17 +814,16 @@ def group_scores(model, state, likely, groups):  # type: ignore[no-untyped-def]
                 scores[group, candidate] += floored_log(rho) - floored_log(usual)
             else:
                 scores[group, candidate] += floored_log(1.0 - rho) - floored_log(1.0 - usual)
-    for pair in range(pairs):
-        for group in range(groups):
-            if tally[group, pair] > 0:
-                scores[group] += tally[group, pair] * likely[pair]
-    for group in range(groups):
-        for candidate in range(candidates):
-            if model.candidate_part[candidate] == part[group]:
-                scores[group, candidate] += math.log(model.prior[candidate])
-            else:
-                scores[group, candidate] = -np.inf
     return scores
+
+
+@njit(nogil=True, cache=True)
+def _take_out_powers(product, powers):  # type: ignore[no-untyped-def]
+    """Leave of each product (G,) what is in [1, 2), and add its power of two to powers (G,)."""
+    bits = product.view(np.int64)
+    for candidate in range(bits.shape[0]):
+        powers[candidate] += (bits[candidate] >> 52) - 1023
+        bits[candidate] = (bits[candidate] & _FRACTION) | _ONE
 
 
 @njit(nogil=True, cache=True)
@@ -792,13 +859,14 @@ def _draw_switches(model, state, generator):  # type: ignore[no-untyped-def]
                 same[place, candidate] += 1.0
             else:
                 changes[place] += 1
-    no_counts, no_costs, nothing = changes[:0], np.empty((0, 1)), weights[:0]
+    no_counts, no_costs, nothing = changes[:0], np.empty((0, 0)), weights[:0]
     for place in range(3):
         parameter = ON_ARRIVAL + place
         if not model.is_fixed[parameter]:
             evidence = Evidence(
                 no_counts,
                 no_costs,
+                nothing,
                 nothing,
                 nothing,
                 changes[place : place + 1],
@@ -837,9 +905,10 @@ class Evidence(NamedTuple):
 
     Attributes:
         counts: (G,) on eta: draws of each candidate.
-        costs: (M, A + 1) on alpha and slip: costs of an action taken, and of all actions.
-        times: (M,) how often.
-        uniform: (M,) its probability if it is a slip.
+        costs: (A + 1, M) on alpha: costs of an action taken, and of all actions.
+        times: (M,) how often it was.
+        shares: (M,) on the probability of a slip: that of an action taken, if it is none.
+        uniform: (M,) on both: its probability if it is a slip.
         changes: (1,) on a switch probability: how often the subgoal changed.
         same: (G,) how often it remained the same.
         weights: (G,) probability of drawing the same again.
@@ -848,6 +917,7 @@ class Evidence(NamedTuple):
     counts: npt.NDArray[np.int64]
     costs: npt.NDArray[np.float64]
     times: npt.NDArray[np.float64]
+    shares: npt.NDArray[np.float64]
     uniform: npt.NDArray[np.float64]
     changes: npt.NDArray[np.int64]
     same: npt.NDArray[np.float64]
@@ -861,7 +931,8 @@ def _draw_concentration(model, state, generator):  # type: ignore[no-untyped-def
         nothing = np.empty(0)
         evidence = Evidence(
             state.counts,
-            np.empty((0, 1)),
+            np.empty((0, 0)),
+            nothing,
             nothing,
             nothing,
             state.counts[:0],
@@ -877,31 +948,44 @@ def _draw_action_parameters(model, state, chosen, confidence_too, generator):  #
 
     Given the slips, either would move in very small steps.
     """
-    actions, candidates = model.cost.shape[1:]
-    keys = np.sort(model.pair_of * candidates + state.subgoal_of)
-    costs = np.empty((keys.shape[0], actions + 1))
-    times = np.zeros(keys.shape[0])
-    uniform = np.empty(keys.shape[0])
-    rows = 0
-    for index in range(keys.shape[0]):
-        if index > 0 and keys[index] == keys[index - 1]:
-            times[rows - 1] += 1.0
-            continue
-        pair, candidate = keys[index] // candidates, keys[index] % candidates
-        cost = model.cost[model.pair_state[pair]]
-        costs[rows, 0] = cost[model.pair_action[pair], candidate]
-        costs[rows, 1:] = cost[:, candidate]
-        times[rows] = 1.0
-        uniform[rows] = model.uniform[model.pair_state[pair]]
-        rows += 1
-    none = state.counts[:0]
-    evidence = Evidence(
-        none, costs[:rows], times[:rows], uniform[:rows], none, times[:0], times[:0]
-    )
+    none, nothing = state.counts[:0], state.parameters[:0]
     if not model.is_fixed[SLIP]:
+        count = state.subgoal_of.shape[0]
+        shares, uniform = np.empty(count), np.empty(count)
+        for t in range(count):
+            shares[t] = chosen[model.pair_of[t], state.subgoal_of[t]]
+            uniform[t] = model.uniform[model.state_of[t]]
+        evidence = Evidence(
+            none, np.empty((0, 0)), nothing, shares, uniform, none, nothing, nothing
+        )
         _draw_by_slice(model, state.parameters, np.int64(SLIP), evidence, generator)
     if confidence_too and not model.is_fixed[ALPHA]:
+        costs, times, uniform = _costs_taken(model, state.subgoal_of)
+        evidence = Evidence(none, costs, times, nothing, uniform, none, nothing, nothing)
         _draw_by_slice(model, state.parameters, np.int64(ALPHA), evidence, generator)
+
+
+@njit(nogil=True, cache=True)
+def _costs_taken(model, subgoal_of):  # type: ignore[no-untyped-def]
+    """The distinct rows of actions and subgoals (M,), as `Evidence` has them on alpha."""
+    actions, candidates = model.cost.shape[1:]
+    keys = np.sort(model.pair_of * candidates + subgoal_of)
+    rows = np.int64(0)
+    times = np.zeros(keys.shape[0])
+    for index in range(keys.shape[0]):
+        if index == 0 or keys[index] != keys[index - 1]:
+            keys[rows] = keys[index]
+            rows += 1
+        times[rows - 1] += 1.0
+    costs, uniform = np.empty((actions + 1, rows)), np.empty(rows)
+    for row in range(rows):
+        pair, candidate = keys[row] // candidates, keys[row] % candidates
+        state = model.pair_state[pair]
+        costs[0, row] = model.cost[state, model.pair_action[pair], candidate]
+        for action in range(actions):
+            costs[action + 1, row] = model.cost[state, action, candidate]
+        uniform[row] = model.uniform[state]
+    return costs, times[:rows], uniform
 
 
 @njit(nogil=True, cache=True)
@@ -949,22 +1033,50 @@ def _log_density(model, parameters, parameter, evidence, scaled):  # type: ignor
         density = -0.5 * ((scaled - math.log(first)) / second) ** 2
     else:
         density = first * math.log(value) + second * math.log1p(-value)
-    counts, costs, times, uniform, changes, same, weights = evidence
     if parameter == ETA:
-        density += log_urns(model, value, counts)
-    for number in changes:
+        density += log_urns(model, value, evidence.counts)
+    for number in evidence.changes:
         density += number * math.log(value)
-    for candidate in range(same.shape[0]):
-        if same[candidate] > 0.0:
-            density += same[candidate] * math.log1p(value * (weights[candidate] - 1.0))
-    alpha = value if parameter == ALPHA else parameters[ALPHA]
-    slip = value if parameter == SLIP else parameters[SLIP]
-    for row in range(costs.shape[0]):
-        total = 0.0
-        for action in range(1, costs.shape[1]):
-            total += math.exp(-alpha * costs[row, action])
-        explained = (1.0 - slip) * math.exp(-alpha * costs[row, 0]) / total
-        density += times[row] * floored_log(explained + slip * uniform[row])
+    for candidate in range(evidence.same.shape[0]):
+        if evidence.same[candidate] > 0.0:
+            density += evidence.same[candidate] * math.log1p(
+                value * (evidence.weights[candidate] - 1.0)
+            )
+    if parameter == SLIP:
+        density += _log_of_slips(value, evidence)
+    if parameter == ALPHA:
+        density += _log_of_costs(value, parameters[SLIP], evidence)
+    return density
+
+
+@njit(nogil=True, cache=True)
+def _log_of_slips(slip, evidence):  # type: ignore[no-untyped-def]
+    """Log probability of the actions by that of a slip."""
+    total, product = 0.0, 1.0
+    for row in range(evidence.shares.shape[0]):
+        product *= (1.0 - slip) * evidence.shares[row] + slip * evidence.uniform[row]
+        if product < 1e-100:  # a single factor is not below `LEAST_PROBABILITY`
+            total += floored_log(product)
+            product = 1.0
+    return total + math.log(product)
+
+
+@njit(nogil=True, cache=True)
+def _log_of_costs(alpha, slip, evidence):  # type: ignore[no-untyped-def]
+    """Log probability of the actions by alpha."""
+    costs = evidence.costs
+    taken, weights = np.empty(costs.shape[1]), np.empty(costs.shape[1])
+    scratch, total = np.empty(costs.shape[1]), np.zeros(costs.shape[1])
+    exponentials(costs[0], -alpha, taken, scratch)
+    for action in range(1, costs.shape[0]):
+        exponentials(costs[action], -alpha, weights, scratch)
+        for row in range(weights.shape[0]):
+            total[row] += weights[row]
+    density = 0.0
+    for row in range(total.shape[0]):
+        share = max(taken[row] / total[row], LEAST_PROBABILITY)
+        probability = (1.0 - slip) * share + slip * evidence.uniform[row]
+        density += evidence.times[row] * math.log(probability)
     return density
 
 

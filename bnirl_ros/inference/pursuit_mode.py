@@ -173,7 +173,7 @@ def _ascend(model, state):  # type: ignore[no-untyped-def]
             if not 0 < state.counts[candidate] <= _FEW:
                 continue
             # Given up (-1), or one of the most likely candidates in its place.
-            for replacement in _replacements(model, state, likely, candidate):
+            for replacement in _replacements(model, state, chosen, candidate):
                 subgoal_of, switched = state.subgoal_of.copy(), state.switched.copy()
                 if replacement < 0:
                     _improve_blocks(model, state, likely, _BLOCKS[0], candidate, candidate)
@@ -229,13 +229,13 @@ def _slips(model, state, chosen):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _replacements(model, state, likely, candidate):  # type: ignore[no-untyped-def]
+def _replacements(model, state, chosen, candidate):  # type: ignore[no-untyped-def]
     """-1, and the candidates that suit the pursuits of one best; none for the only one there."""
     state.partition_of[:] = 1
     for t in range(state.subgoal_of.shape[0]):
         if state.subgoal_of[t] == candidate:
             state.partition_of[t] = 0
-    scores = group_scores(model, state, likely, np.int64(2))[0]
+    scores = group_scores(model, state, chosen, np.int64(2))[0]
     best = scores.argsort()[::-1][:_REPLACEMENTS]
     # Those of another part of the map, at -inf, are none.
     best = best[(scores[best] > -np.inf) & (best != candidate)]
@@ -269,7 +269,7 @@ def _climb(model, state, chosen, likely):  # type: ignore[no-untyped-def]
     while True:
         for length in _BLOCKS:
             _improve_blocks(model, state, likely, length, _NONE, _NONE)
-        _move_subgoals(model, state, chosen, likely)
+        _move_subgoals(model, state, chosen)
         now = log_joint_of(model, state, chosen)
         if now <= value + _GAIN:
             return now
@@ -402,7 +402,7 @@ def _path_score(model, parameters, likely, weights, path, switched, theta, first
 
 
 @njit(nogil=True, cache=True)
-def _move_subgoals(model, state, chosen, likely):  # type: ignore[no-untyped-def]
+def _move_subgoals(model, state, chosen):  # type: ignore[no-untyped-def]
     """All pursuits of a subgoal to the candidate that suits them best, if the joint gains."""
     candidates = state.counts.shape[0]
     group_of = np.full(candidates, -1, dtype=np.int32)
@@ -412,7 +412,7 @@ def _move_subgoals(model, state, chosen, likely):  # type: ignore[no-untyped-def
             group_of[state.subgoal_of[t]] = groups
             groups += 1
         state.partition_of[t] = group_of[state.subgoal_of[t]]
-    scores = group_scores(model, state, likely, groups)
+    scores = group_scores(model, state, chosen, groups)
     value = log_joint_of(model, state, chosen)
     for old in range(candidates):
         if group_of[old] < 0:
