@@ -51,6 +51,7 @@ _SLICE = 0.7  # first width of a slice, of a logarithm
 _OVERHEAD = 400  # candidates for which an observation takes as long as for what is done once
 _RELOCATED = 4000  # observations, beyond which a subgoal is relocated less than once in a sweep
 _RELOCATIONS = 4  # in a sweep over few observations
+_LANES = 40  # candidates open to a relocation, beyond which there are fewer relocations
 _HEAVY = 1e-6  # a weight above which a candidate's place matters to a relocation
 _LN_2 = math.log(2.0)
 _FRACTION, _ONE = np.int64((1 << 52) - 1), np.int64(1023 << 52)  # bits of a float64
@@ -272,13 +273,13 @@ def _advance(  # type: ignore[no-untyped-def]
     """`chosen` (K, G) and `forward` (block, G) are room for the softmax table and a block."""
     _fill_softmax_table(model, state.parameters[ALPHA], chosen)
     scratch = np.empty(state.subgoal_of.shape[0], dtype=np.int32)
-    # A draw of alpha takes a new table, an exponential for each cost: it comes round so rarely
-    # that this is less than half of all work. What an observation takes besides its candidates
-    # counts as `_OVERHEAD` of them.
-    work = scratch.shape[0] * (model.prior.shape[0] + _OVERHEAD)
-    period = 1 + 2 * model.cost.size // work
     relocation_period = 1 + scratch.shape[0] // _RELOCATED
     relocations = min(1 + _RELOCATED // (1 + scratch.shape[0]), _RELOCATIONS)
+    # A draw of alpha takes a new table, an exponential for each cost: it comes round so rarely
+    # that this is less than a third of all work. What an observation takes besides its candidates
+    # counts as so many of them.
+    overhead = _OVERHEAD * (1 + relocations) // relocation_period
+    period = 1 + 4 * model.cost.size // (scratch.shape[0] * (model.prior.shape[0] + overhead))
     for draw in range(log_joint.shape[0]):
         for _ in range(thin):
             _draw_blocks(model, state, chosen, forward, generator)
@@ -618,6 +619,8 @@ def _relocate(model, state, chosen, generator):  # type: ignore[no-untyped-def]
     for first, end in bounds:
         longest = max(longest, end - first)
     if len(window) < 2 or longest * candidates.shape[0] > _BLOCK_ENTRIES:
+        return
+    if generator.random() * candidates.shape[0] > _LANES:  # as rare as it is expensive
         return
     small = _restricted(model, candidates)
     likely = np.ascontiguousarray(chosen[:, candidates])
