@@ -10,31 +10,42 @@ the machine, the filter alone in plain numpy, which does for each observation wh
 without: one product and sum over the candidates.
 
 Then, for the shipped bags, effective samples for each second of CPU time: of log joint, number of
-partitions and parameters the one that mixes worst, and alpha.
+partitions and parameters the one that mixes worst, and alpha. At last, the memory that an
+inference from a million observations takes at most, with as many draws as are ever kept, from the
+demonstration to all result files but the picture.
 """
 
 from __future__ import annotations
 
 import argparse
+import resource
+import subprocess
 import sys
+import tempfile
 import time
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from bnirl_ros.bags.demonstration import read_demonstration
+from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.demonstrations.placement import place
 from bnirl_ros.experiments.machine import machine
 from bnirl_ros.inference import pursuit_gibbs
 from bnirl_ros.inference.chains import run_chains
 from bnirl_ros.inference.diagnostics import effective_sample_size
-from bnirl_ros.inference.posterior import model_of
+from bnirl_ros.inference.posterior import infer, model_of
 from bnirl_ros.inference.settings import Settings
+from bnirl_ros.inference.summary import summarise
+from bnirl_ros.maps.grid_map import GridMap
 from bnirl_ros.mdp.grid_world import GridWorld
 from bnirl_ros.model.pursuits import ALPHA, PRIORS, PursuitModel, pursuit_model
 from bnirl_ros.resources import share_folder
+from bnirl_ros.views.results import posterior_arrays, subgoals_document, write_arrays
 
 BOUND = 2.0  # [ns] for each observation and candidate
+MEMORY_BOUND = 2.0  # [GiB] for a million observations
 CONFIDENCE, SLIP = 3.0, 0.05
 SETTLING, SWEEPS, RUNS = 60, 24, 5
 BAGS = ("paper_loop", "overcooked_random3", "turtle_waypoints")
@@ -139,6 +150,33 @@ def effective_samples(name: str) -> dict[str, float]:
     return {each: (effective_sample_size(of) or 0.0) / spent for each, of in traces.items()}
 
 
+def infer_from_a_million() -> None:
+    """A million observations in 2,000 episodes along the corridors of a map of 100 x 100 cells."""
+    free = np.zeros((100, 100), dtype=np.bool_)
+    free[::33] = free[:, ::33] = True  # 784 cells, all of them candidates
+    grid_map = GridMap(free)
+    world = GridWorld(free)
+    states, actions, starts = demonstrated(world, episodes=2000, length=500, subgoals=8)
+    nowhere = np.empty(0, dtype=np.int64)
+    demonstration = Demonstration(
+        np.cumsum(starts) - 1, world.cells_of(states), actions, nowhere, nowhere.reshape(0, 2)
+    )
+    # 132 draws of all chains: the most that fit into the limit.
+    posterior = infer(demonstration, grid_map, Settings(sweeps=36, burn_in=3))
+    assert posterior.settings.thin == 1
+    summary = summarise(posterior, grid_map)
+    subgoals_document(summary, grid_map, posterior.settings)
+    with tempfile.TemporaryDirectory() as folder:
+        write_arrays(Path(folder) / "posterior.npz", posterior_arrays(posterior))
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
+
+
+def memory_for_a_million() -> float:
+    """The most memory that a process took for that [GiB]."""
+    command = [sys.executable, __file__, "--million"]
+    return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
 CASES = {
     "1,000 candidates, 20 episodes": (in_parts(25, 40, 1), 20, 500, 1000),
     "1,000 candidates, one episode": (in_parts(25, 40, 1), 1, 10_000, 1000),
@@ -153,7 +191,12 @@ def main() -> int:
     """Print a table, and whether the bound is kept."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", default="", help="cases whose name has this in it")
-    only = parser.parse_args().only
+    parser.add_argument("--million", action="store_true", help="infer from a million, no table")
+    options = parser.parse_args()
+    if options.million:
+        infer_from_a_million()
+        return 0
+    only = options.only
     print(machine())
     print(f"{'':36s}{'ms a draw':>12s}{'ns':>8s}{'numpy filter':>15s}  at most {BOUND:g} ns")
     kept = True
@@ -174,6 +217,10 @@ def main() -> int:
         worst = min(sizes, key=sizes.__getitem__)
         alpha = sizes[list(PRIORS)[ALPHA]]
         print(f"{name:36s}{sizes[worst]:8.0f}{alpha:8.0f}  {worst}", flush=True)
+    memory = memory_for_a_million()
+    kept &= memory <= MEMORY_BOUND
+    verdict = "" if memory <= MEMORY_BOUND else "BROKEN"
+    print(f"\na million observations: {memory:.2f} GiB, at most {MEMORY_BOUND:g}  {verdict}")
     return 0 if kept else 1
 
 

@@ -9,13 +9,21 @@ from threading import Event
 import numpy as np
 import numpy.typing as npt
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.errors import InputError
 from bnirl_ros.inference import pursuit_mode
 from bnirl_ros.inference.chains import StoppedError, run_chains
 from bnirl_ros.inference.mode import ascend
-from bnirl_ros.inference.posterior import Posterior, grid_world, infer, model_of
+from bnirl_ros.inference.posterior import (
+    Posterior,
+    grid_world,
+    infer,
+    model_of,
+    within_memory,
+)
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.inference.summary import episode_visits, summarise
 from bnirl_ros.maps.grid_map import GridMap
@@ -326,3 +334,38 @@ def test_a_visit_is_an_arrival_at_what_was_pursued() -> None:
     assert visits_of([(1, 0), (2, 0), (2, 0), (2, 0)], [1, 1, 1, 1], last=False) == [[1]]
     # pursued to the end without arrival: where its last observation was
     assert visits_of([(0, 0), (1, 0), (2, 0), (1, 0)], [1, 1, 2, 2], last=False) == [[1, 2]]
+
+
+@given(
+    st.integers(1, 3000),
+    st.integers(0, 500),
+    st.integers(1, 50),
+    st.integers(1, 16),
+    st.integers(0, 10**8),
+)
+def test_draws_are_thinned_out_only_where_they_take_too_much_memory(
+    draws: int, burn_in: int, thin: int, chains: int, observations: int
+) -> None:
+    asked = Settings(sweeps=burn_in + draws * thin, burn_in=burn_in, thin=thin, chains=chains)
+    each = 8 * chains * observations  # of a subgoal and a partition, in bytes
+    given_back = within_memory(asked, observations)
+    if asked.draws * each <= 2**30:
+        assert given_back == asked
+    else:
+        assert given_back.draws == 1 or (
+            given_back.draws * each <= 2**30
+            # One step less, and it would have been too much.
+            and asked.draws // (given_back.thin // thin - 1) * each > 2**30
+        )
+        assert replace(given_back, thin=thin) == asked
+
+
+def test_draws_are_thinned_out_to_fit_into_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = replace(QUICK, sweeps=40, burn_in=10)
+    whole = infer(ROUND, MAP, settings)
+    monkeypatch.setattr("bnirl_ros.inference.draws.DRAW_MEMORY", 8 * 3 * 10 * len(ROUND))
+    thinned = infer(ROUND, MAP, settings)
+    assert (whole.settings.thin, thinned.settings.thin) == (1, 3)
+    # Every third draw of the same chains.
+    kept = whole.draws.subgoal_of[:, 2::3]
+    np.testing.assert_array_equal(thinned.draws.subgoal_of, kept)

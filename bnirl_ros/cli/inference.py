@@ -198,7 +198,13 @@ def inferred(demonstration: Demonstration, grid_map: GridMap, settings: Settings
 
     total = settings.sweeps * settings.chains
     with progress_bar("Sampling", total, before="Solving the goals") as progress:
-        return infer(demonstration, grid_map, settings, progress)
+        posterior = infer(demonstration, grid_map, settings, progress)
+    if posterior.settings.thin != settings.thin:
+        print(
+            f"Kept one draw in {posterior.settings.thin} sweeps, so that the draws of "
+            f"{len(demonstration)} observations fit into 1 GiB"
+        )
+    return posterior
 
 
 def print_rate(posterior: Posterior) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from bnirl_ros.inference.convergence import LEAST_ESS
-from bnirl_ros.inference.draws import Draws
+from bnirl_ros.inference.draws import Draws, most_draws
 from bnirl_ros.inference.samplers import Model, sampler_of
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.threads import workers
@@ -146,6 +146,11 @@ class _Chains:
     def __len__(self) -> int:
         return len(self._states)
 
+    @property
+    def observations(self) -> int:
+        """How many observations a draw has."""
+        return self.room_for(1).subgoal_of.shape[-1]
+
     def room_for(self, draws: int) -> Draws:
         """Room for so many draws of each chain."""
         return self._sampler.room_for(self._model, (len(self), draws))
@@ -199,7 +204,8 @@ class _Growing:
         asked = (settings.sweeps - self._first) // settings.thin
         # Half of them may be burn-in; of two draws that are not alike one counts at the least.
         enough = 4 * int(LEAST_ESS) // len(chains)
-        self._capacity = -(-max(asked, 2 * enough) // 2) * 2
+        most = most_draws(len(chains), chains.observations)
+        self._capacity = -(-max(asked, min(2 * enough, most)) // 2) * 2
         self._draws = chains.room_for(self._capacity)
 
     @property

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+DRAW_MEMORY = 1 << 30
+"""What the draws of all chains may take [bytes], unless a single one of each takes more."""
+
 
 @dataclass(frozen=True, eq=False)
 class Draws:
@@ -53,3 +56,9 @@ class Draws:
     def partition_count(self) -> npt.NDArray[np.int64]:
         """(...,) number of partitions in each draw."""
         return np.asarray(self.partition_of.max(axis=-1, initial=-1) + 1, dtype=np.int64)
+
+
+def most_draws(chains: int, observations: int) -> int:
+    """How many draws of each chain fit into `DRAW_MEMORY`; at least one. Each takes 8 bytes for
+    an observation."""
+    return max(1, DRAW_MEMORY // (8 * chains * max(observations, 1)))

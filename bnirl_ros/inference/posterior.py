@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Event
 from typing import Any
 
@@ -14,7 +14,7 @@ from bnirl_ros.errors import InputError
 from bnirl_ros.inference import mode, pursuit_mode
 from bnirl_ros.inference.chains import Progress, Sampling, run_until
 from bnirl_ros.inference.convergence import Convergence, convergence_of, traces_of
-from bnirl_ros.inference.draws import Draws
+from bnirl_ros.inference.draws import Draws, most_draws
 from bnirl_ros.inference.known_goals import KnownGoals
 from bnirl_ros.inference.mode import Mode
 from bnirl_ros.inference.runs import run_counts
@@ -67,9 +67,12 @@ class Posterior:
             region_of: (G,) candidate that stands for each one; by default each for itself.
         """
         drawn = self.draws.subgoal_of.reshape(-1, len(self.demonstration))
-        if region_of is not None:
-            drawn = np.append(region_of, np.int32(-1))[drawn]
-        return np.asarray(run_counts(drawn, self.demonstration.starts, len(self.candidates)))
+        starts, count = self.demonstration.starts, len(self.candidates)
+        if region_of is None:
+            return np.asarray(run_counts(drawn, starts, count))
+        regions = np.append(region_of, np.int32(-1))
+        # Draw by draw, as all draws of a long demonstration are most of the memory there is.
+        return np.concatenate([run_counts(regions[each[None]], starts, count) for each in drawn])
 
     def subgoal_probability(self) -> npt.NDArray[np.float64]:
         """(G,) share of the draws in which each candidate is some observation's subgoal."""
@@ -220,6 +223,12 @@ def watched_in(
     return traces_of(draws, demonstration.starts, subgoals, names)
 
 
+def within_memory(settings: Settings, observations: int) -> Settings:
+    """The settings, or with so much more thinning that all draws fit into `DRAW_MEMORY`."""
+    most = most_draws(settings.chains, observations)
+    return replace(settings, thin=settings.thin * (settings.draws // (most + 1) + 1))
+
+
 def infer(
     demonstration: Demonstration,
     grid_map: GridMap,
@@ -231,7 +240,8 @@ def infer(
     """Sample the posterior of a demonstration's subgoals with fresh chains from the seed.
 
     Equal demonstrations, maps and settings give equal posteriors, bit for bit, unless time runs
-    out: this is what `bnirl infer` and the node's `~/infer` run.
+    out: this is what `bnirl infer` and the node's `~/infer` run. Draws that would not be
+    `within_memory` are thinned out, which the settings of the posterior tell.
 
     Args:
         demonstration: observations on free cells of the map.
@@ -247,6 +257,7 @@ def infer(
     """
     if len(demonstration) == 0:
         raise InputError("there is no observation to infer from; a pose and an action make one")
+    settings = within_memory(settings, len(demonstration))
     candidates, model = model_of(demonstration, grid_map, settings)
 
     def is_enough(draws: Draws) -> bool:

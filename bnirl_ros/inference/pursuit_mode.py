@@ -18,6 +18,7 @@ from bnirl_ros.inference.draws import Draws
 from bnirl_ros.inference.kernels import count_draws
 from bnirl_ros.inference.mode import Mode
 from bnirl_ros.inference.pursuit_gibbs import (
+    KernelModel,
     filled_forward,
     floored_log,
     group_scores,
@@ -57,13 +58,25 @@ def posterior_mode(model: PursuitModel, chains: Draws) -> Mode:
     """
     parameters = np.median(chains.parameters.reshape(-1, len(PRIORS)), axis=0)
     best = chains.log_joint.argmax(axis=1)
+    tables = _tables(model, parameters)
     with workers(len(best)) as threads:
         modes = threads.map(
-            lambda chain, draw: ascend(model, chains.subgoal_of[chain, draw], parameters),
+            lambda chain, draw: _ascended(
+                model, chains.subgoal_of[chain, draw], parameters, *tables
+            ),
             range(len(best)),
             best,
         )
         return max(modes, key=lambda mode: mode.log_joint)
+
+
+def _tables(
+    model: PursuitModel, parameters: npt.NDArray[np.float64]
+) -> tuple[KernelModel, npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """What all ascents with the same parameters read: `softmax_table` and its logarithms."""
+    kernel = kernel_model(model)
+    chosen = softmax_table(kernel, parameters[ALPHA])
+    return kernel, chosen, log_likelihood_table(kernel, parameters, chosen)
 
 
 def ascend(
@@ -77,10 +90,22 @@ def ascend(
             taken for part of the pursuit around it.
         parameters: in the order of `PRIORS`.
     """
+    return _ascended(model, subgoal_of, parameters, *_tables(model, parameters))
+
+
+def _ascended(
+    model: PursuitModel,
+    subgoal_of: npt.ArrayLike,
+    parameters: npt.NDArray[np.float64],
+    kernel: KernelModel,
+    chosen: npt.NDArray[np.float64],
+    likely: npt.NDArray[np.float64],
+) -> Mode:
+    """`ascend` with its tables."""
     given = np.asarray(subgoal_of, dtype=np.int32)
     subgoals = _with_slips(model, given)
     state = state_of(model, subgoals, model.starts, parameters)
-    return _mode(subgoals, *_ascend(kernel_model(model), state))
+    return _mode(subgoals, *_ascend(kernel, state, chosen, likely))
 
 
 def extended(
@@ -161,10 +186,8 @@ def _next_known(subgoal_of: npt.NDArray[np.int32], model: PursuitModel) -> npt.N
 
 
 @njit(nogil=True, cache=True)
-def _ascend(model, state):  # type: ignore[no-untyped-def]
+def _ascend(model, state, chosen, likely):  # type: ignore[no-untyped-def]
     """Ascent that changes `state`; returns the log joint and (N,) which actions are slips."""
-    chosen = softmax_table(model, state.parameters[ALPHA])
-    likely = log_likelihood_table(model, state.parameters, chosen)
     value = _climb(model, state, chosen, likely)
     gained = True
     while gained:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from bnirl_ros.demonstrations.placement import Placement
 from bnirl_ros.inference import mode, pursuit_mode
 from bnirl_ros.inference.chains import CONVERGED, SWEEP_LIMIT, TIME_BUDGET, Sampling
-from bnirl_ros.inference.draws import Draws
+from bnirl_ros.inference.draws import Draws, most_draws
 from bnirl_ros.inference.known_goals import KnownGoals
 from bnirl_ros.inference.mode import Mode
 from bnirl_ros.inference.particles import EACH, Particles, taken_in
@@ -64,7 +64,8 @@ class RunningPosterior:
         self.sweeps = 0
         self._seconds = 0.0
         self._converged, self._next_look = False, settings.sweeps
-        self._capacity = CAPACITY * max(1, 4 // settings.chains)
+        most = most_draws(settings.chains, len(placement.demonstration))
+        self._capacity = max(2, min(CAPACITY * max(1, 4 // settings.chains), most // 2 * 2))
         same = before if before and before._is_about(grid_map, settings) else None
         self._known: KnownGoals = same._known if same else known_goals(grid_map, settings)
         self._candidates, self._model = model_of(

@@ -43,7 +43,8 @@ def write_results(
     Raises:
         InputError: the folder cannot be written to.
     """
-    text = json.dumps(subgoals_document(summary, grid_map, settings), indent=2) + "\n"
+    # Those of the posterior tell whether draws were thinned out to fit into memory.
+    text = json.dumps(subgoals_document(summary, grid_map, posterior.settings), indent=2) + "\n"
     writers: dict[str, Callable[[Path], object]] = {
         "subgoals.json": lambda path: path.write_text(text, encoding="utf-8"),
         "posterior.npz": lambda path: write_arrays(path, posterior_arrays(posterior)),
