@@ -22,6 +22,8 @@ from bnirl_ros.inference.draws import Draws
 from bnirl_ros.inference.kernels import categorical, number_in_order
 from bnirl_ros.model.mixture import SubgoalMixture
 
+_VANISHING = -50.0  # [nats] what is so much less probable than another changes no sum of doubles
+
 
 class PartitionState(NamedTuple):
     """State of one chain, in arrays that sampling changes: who sits where, and goes for what.
@@ -62,7 +64,12 @@ class _Model(NamedTuple):
     by_pair: npt.NDArray[np.int64]
 
 
-def _model(mixture: SubgoalMixture) -> _Model:
+def kernel_model(mixture: SubgoalMixture) -> _Model:
+    """A mixture as the kernels take it."""
+    # Pairs as they first occur: one after the other, they often have the same subgoal.
+    count = len(mixture.pair_of)
+    first = np.zeros(len(mixture.log_likelihood), dtype=np.int64)
+    first[mixture.pair_of[::-1]] = np.arange(count)[::-1]
     return _Model(
         log_likelihood=mixture.log_likelihood,
         scaled_likelihood=mixture.scaled_likelihood,
@@ -71,7 +78,7 @@ def _model(mixture: SubgoalMixture) -> _Model:
         prior=np.exp(mixture.log_prior),
         eta=float(mixture.eta),
         pair_of=mixture.pair_of,
-        by_pair=np.argsort(mixture.pair_of, kind="stable"),
+        by_pair=np.argsort(first[mixture.pair_of], kind="stable"),
     )
 
 
@@ -124,7 +131,7 @@ def going_on(
     _, first, number = np.unique(slots, return_index=True, return_inverse=True)
     partitions[known] = number
     now = _state(partitions, subgoals[first])
-    _draw_partitions(_model(mixture), now, np.flatnonzero(partitions < 0), generator)
+    _draw_partitions(kernel_model(mixture), now, np.flatnonzero(partitions < 0), generator)
     return now
 
 
@@ -142,31 +149,39 @@ def advance(
     generators give equal draws.
     """
     arrays = (draws.subgoal_of, draws.partition_of, draws.log_joint)
-    _advance(_model(mixture), state, generator, thin, *arrays)
+    _advance(kernel_model(mixture), state, generator, thin, *arrays)
 
 
 @njit(nogil=True, cache=True)
 def _advance(model, state, generator, thin, subgoal_of, partition_of, log_joint):  # type: ignore[no-untyped-def]
     everyone = np.arange(state.partition_of.shape[0])
+    nothing_known = np.zeros(model.prior.shape[0], dtype=np.int64)
     scratch = np.empty(state.partition_of.shape[0], dtype=np.int32)
     for draw in range(log_joint.shape[0]):
         for _ in range(thin):
-            _draw_subgoals(model, state, generator)
+            draw_subgoals(model, state, generator)
             _draw_partitions(model, state, everyone, generator)
-            _redraw_partitions(model, state, generator)
-        log_joint[draw] = _log_joint(model, state)
+            subgoals = state.subgoal_of_slot[state.partition_of]
+            redraw_partitions(model, state, subgoals, nothing_known, generator)
+        log_joint[draw] = log_joint_of(model, state)
         partition_of[draw] = state.partition_of
         number_in_order(partition_of[draw], scratch)
         subgoal_of[draw] = state.subgoal_of_slot[state.partition_of]
 
 
 @njit(nogil=True, cache=True)
-def _draw_subgoals(model, state, generator):  # type: ignore[no-untyped-def]
+def draw_subgoals(model, state, generator):  # type: ignore[no-untyped-def]
     """Step 2(a): every partition's subgoal from (17)."""
     scores = _subgoal_scores(model, state)
     for position in range(state.occupied[0]):
-        weights = np.exp(scores[position] - scores[position].max())
-        subgoal = categorical(weights, weights.sum(), generator)
+        weights = scores[position]
+        most, total = weights.max(), 0.0
+        for candidate in range(weights.shape[0]):
+            # Most candidates explain that much worse, and exponentials are slow.
+            below = weights[candidate] - most
+            weights[candidate] = math.exp(below) if below > _VANISHING else 0.0
+            total += weights[candidate]
+        subgoal = categorical(weights, total, generator)
         state.subgoal_of_slot[state.slots[position]] = subgoal
 
 
@@ -226,15 +241,17 @@ def _draw_partitions(model, state, chosen, generator):  # type: ignore[no-untype
 
 
 @njit(nogil=True, cache=True)
-def _redraw_partitions(model, state, generator):  # type: ignore[no-untyped-def]
-    """All partitions anew, given every observation's subgoal.
+def redraw_partitions(model, state, subgoal_of, together, generator):  # type: ignore[no-untyped-def]
+    """All partitions anew, given every observation's subgoal (N,).
 
     P(z | subgoals) is proportional to prod_j eta P(g_j) (n_j - 1)!: among the observations with
     subgoal g, a Chinese restaurant process with concentration eta P(g). Without this step two
     partitions that found the same subgoal take very long to become one, observation by
     observation.
+
+    `together` (G,) tells how many of the first with each subgoal are in one partition and the next
+    one is not, where that is drawn already; 0 where it is not.
     """
-    subgoal_of = state.subgoal_of_slot[state.partition_of]
     seated = np.zeros(model.prior.shape[0], dtype=np.int64)
     first_slot = np.full(model.prior.shape[0], -1, dtype=np.int64)
     next_slot = np.full(subgoal_of.shape[0], -1, dtype=np.int64)
@@ -242,13 +259,18 @@ def _redraw_partitions(model, state, generator):  # type: ignore[no-untyped-def]
     state.occupied[0] = 0
     for i in range(subgoal_of.shape[0]):
         subgoal = subgoal_of[i]
-        remaining = generator.random() * (seated[subgoal] + model.eta * model.prior[subgoal])
         slot = first_slot[subgoal]
-        while slot >= 0:
-            remaining -= state.size_of_slot[slot]
-            if remaining < 0.0:
-                break
-            slot = next_slot[slot]
+        if seated[subgoal] >= together[subgoal]:
+            if seated[subgoal] == together[subgoal] and seated[subgoal] > 0:
+                slot = -1
+            else:
+                remaining = seated[subgoal] + model.eta * model.prior[subgoal]
+                remaining *= generator.random()
+                while slot >= 0:
+                    remaining -= state.size_of_slot[slot]
+                    if remaining < 0.0:
+                        break
+                    slot = next_slot[slot]
         if slot < 0:
             slot = state.slots[state.occupied[0]]
             next_slot[slot] = first_slot[subgoal]
@@ -284,7 +306,7 @@ def _put_in(state, i, position):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _log_joint(model, state):  # type: ignore[no-untyped-def]
+def log_joint_of(model, state):  # type: ignore[no-untyped-def]
     """Log of (10), as `SubgoalMixture.log_joint`."""
     count = state.partition_of.shape[0]
     total = state.occupied[0] * math.log(model.eta)
