@@ -1,4 +1,4 @@
-"""The sampler draws from the right posterior: enumeration, a Geweke test, and a plain twin.
+"""The samplers draw from the right posterior: enumeration, a Geweke test, and a plain twin.
 
 Statistical tests have fixed seeds. Their false-alarm rates, had the seeds been drawn anew, are
 stated beside the bounds.
@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import ModuleType
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from bnirl_ros.experiments.printed_sum import PlainSampler
-from bnirl_ros.inference import partition_gibbs
+from bnirl_ros.inference import partition_gibbs, urn_gibbs
 from bnirl_ros.inference.diagnostics import effective_sample_size
 from bnirl_ros.inference.draws import Draws
 from bnirl_ros.mdp.goal_values import goal_values
@@ -26,6 +27,8 @@ from reference import Enumeration
 CORRIDOR = np.ones((1, 7), dtype=bool)
 ROOMS = np.array([[1, 1, 1, 0, 1], [1, 0, 1, 1, 1], [1, 1, 1, 0, 1]], dtype=bool)
 OPEN = np.ones((4, 4), dtype=bool)
+
+SAMPLERS = [partition_gibbs, urn_gibbs]
 
 CASES = [
     # name, free space, moves, alpha, eta, number of observations
@@ -60,14 +63,28 @@ def every_pair_mixture(
     return mixture, first_rows, actions
 
 
-def drawn_by_kernel(mixture: SubgoalMixture, draws: int, seed: int) -> Draws:
+def drawn_by(sampler: ModuleType, mixture: SubgoalMixture, draws: int, seed: int) -> Draws:
     generator = np.random.default_rng(seed)
-    state = partition_gibbs.initial_state(mixture, generator)
+    state = sampler.initial_state(mixture, generator)
     kept = Draws.empty((draws,), len(mixture.pair_of))
-    partition_gibbs.advance(
-        mixture, state, generator, Draws.empty((1,), kept.subgoal_of.shape[1]), 500
-    )
-    partition_gibbs.advance(mixture, state, generator, kept)
+    sampler.advance(mixture, state, generator, Draws.empty((1,), kept.subgoal_of.shape[1]), 500)
+    sampler.advance(mixture, state, generator, kept)
+    return kept
+
+
+def drawn_by_urn_alone(mixture: SubgoalMixture, draws: int, seed: int) -> Draws:
+    """Subgoals from the urn only, none from (17), and partitions given these."""
+    generator = np.random.default_rng(seed)
+    model = partition_gibbs.kernel_model(mixture)
+    state = urn_gibbs.initial_state(mixture, generator)
+    kept = Draws.empty((draws,), len(mixture.pair_of))
+    subgoal_of = state.subgoal_of_slot[state.partition_of]
+    for draw in range(draws):
+        urn_gibbs._draw_from_urn(model, subgoal_of, generator)
+        urn_gibbs._draw_partitions(model, state, subgoal_of, generator)
+        kept.subgoal_of[draw] = subgoal_of
+        first_seen = np.unique(state.partition_of, return_index=True, return_inverse=True)
+        kept.partition_of[draw] = np.argsort(np.argsort(first_seen[1]))[first_seen[2]]
     return kept
 
 
@@ -106,14 +123,31 @@ def total_variations(mixture: SubgoalMixture, draws: Draws) -> dict[str, float]:
     }
 
 
+@pytest.mark.parametrize("sampler", SAMPLERS)
 @pytest.mark.parametrize("case", CASES, ids=[case[0] for case in CASES])
-def test_draws_agree_with_every_set_partition(case: tuple) -> None:  # type: ignore[type-arg]
+def test_draws_agree_with_every_set_partition(
+    case: tuple,  # type: ignore[type-arg]
+    sampler: ModuleType,
+) -> None:
     # 200,000 draws, at worst some 20,000 independent ones: a probability is known to a standard
     # deviation of 0.0035, so that 0.02 is passed by chance less than once in 10^7.
     _, free, moves, alpha, eta, count = case
     mixture, _, _ = every_pair_mixture(free, moves, alpha, eta, count, seed=1)
-    distances = total_variations(mixture, drawn_by_kernel(mixture, 200_000, seed=2))
+    distances = total_variations(mixture, drawn_by(sampler, mixture, 200_000, seed=2))
     assert max(distances.values()) <= 0.02, distances
+
+
+@pytest.mark.parametrize("case", CASES[2:4], ids=[case[0] for case in CASES[2:4]])
+def test_the_urn_alone_has_the_posterior(case: tuple) -> None:  # type: ignore[type-arg]
+    # Some 5,000 independent draws: a standard deviation of 0.007, so 0.04 is out of reach of
+    # chance; equal observations, of which there are two here, are drawn one after the other.
+    _, free, moves, alpha, eta, count = case
+    mixture, _, _ = every_pair_mixture(free, moves, alpha, eta, count, seed=1)
+    pair_of = mixture.pair_of.copy()
+    pair_of[-1] = pair_of[0]
+    mixture = replace(mixture, pair_of=pair_of)
+    distances = total_variations(mixture, drawn_by_urn_alone(mixture, 20_000, seed=2))
+    assert max(distances.values()) <= 0.04, distances
 
 
 def test_the_printed_sum_is_not_the_posterior() -> None:
@@ -141,9 +175,10 @@ def test_the_kernel_is_its_plain_twin_draw_for_draw() -> None:
         np.testing.assert_array_equal(kept.subgoal_of, plain.subgoal_of)
 
 
-def test_log_joint_of_a_draw_is_the_one_of_equation_10() -> None:
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_log_joint_of_a_draw_is_the_one_of_equation_10(sampler: ModuleType) -> None:
     mixture, _, _ = every_pair_mixture(ROOMS, 8, 0.5, 0.7, 30, seed=5)
-    draws = drawn_by_kernel(mixture, 50, seed=1)
+    draws = drawn_by(sampler, mixture, 50, seed=1)
     for draw in range(50):
         _, first = np.unique(draws.partition_of[draw], return_index=True)
         plain = mixture.log_joint(draws.partition_of[draw], draws.subgoal_of[draw][first])
@@ -239,17 +274,21 @@ def geweke_scores(
 GEWEKE_CASES = [CASES[0], CASES[1], CASES[4]]
 
 
+@pytest.mark.parametrize("sampler", SAMPLERS)
 @pytest.mark.parametrize("case", GEWEKE_CASES, ids=[case[0] for case in GEWEKE_CASES])
-def test_geweke_joint_distribution(case: tuple) -> None:  # type: ignore[type-arg]
-    # Nine functionals, three cases, |z| <= 4.5: a false alarm once in 5,000 runs. Power: see below
-    # what the printed sum shows in fewer rounds.
+def test_geweke_joint_distribution(
+    case: tuple,  # type: ignore[type-arg]
+    sampler: ModuleType,
+) -> None:
+    # Nine functionals, three cases, two samplers, |z| <= 4.5: a false alarm once in 2,500 runs.
+    # Power: see below what the printed sum shows in fewer rounds.
     generator = np.random.default_rng(13)
     first = every_pair_mixture(*case[1:], seed=11)[0]
-    state = partition_gibbs.initial_state(first, generator)
+    state = sampler.initial_state(first, generator)
     draw = Draws.empty((1,), case[5])
 
     def sweep(mixture: SubgoalMixture) -> Draws:
-        partition_gibbs.advance(mixture, state, generator, draw)
+        sampler.advance(mixture, state, generator, draw)
         return draw
 
     scores = geweke_scores(case, sweep, rounds=8_000)

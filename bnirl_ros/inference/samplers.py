@@ -7,7 +7,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 import numpy.typing as npt
 
-from bnirl_ros.inference import partition_gibbs, pursuit_gibbs
+from bnirl_ros.inference import pursuit_gibbs, urn_gibbs
 from bnirl_ros.inference.draws import Draws
 from bnirl_ros.model.mixture import SubgoalMixture
 from bnirl_ros.model.pursuits import PursuitModel
@@ -50,5 +50,5 @@ class Sampler(Protocol):
 
 def sampler_of(model: Model) -> Sampler:
     """The sampler of a model."""
-    module = partition_gibbs if isinstance(model, SubgoalMixture) else pursuit_gibbs
+    module = urn_gibbs if isinstance(model, SubgoalMixture) else pursuit_gibbs
     return cast("Sampler", module)
