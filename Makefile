@@ -64,8 +64,8 @@ reference: venv  ## Write docs/reference.md, the topics and parameters of the no
 	$(BIN)/python -m bnirl_ros.nodes.reference docs/reference.md
 
 # All of them run, also where one misses its bound.
-BENCHMARKS ?= main_job start_up running load replay large_bag goal_values sequential convergence \
-	growth
+BENCHMARKS ?= main_job start_up running load replay large_bag goal_values sequential paper_sampler \
+	convergence growth
 
 benchmark: venv  ## Time the main job, its parts and the node, and see how cost grows
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[benchmark]'
