@@ -88,7 +88,8 @@ class Told:
 
 
 def told(demonstration: Demonstration, grid_map: GridMap, **settings: Any) -> Told:
-    posterior = infer(demonstration, grid_map, Settings(sweeps=80, burn_in=20, **settings))
+    # So few draws that a candidate of a single one has more than one per cent.
+    posterior = infer(demonstration, grid_map, Settings(sweeps=25, burn_in=5, **settings))
     return Told(posterior, summarise(posterior, grid_map), grid_map)
 
 

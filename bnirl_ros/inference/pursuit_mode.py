@@ -1,8 +1,9 @@
 """The posterior mode of the sequential model: the most probable pursuits.
 
 Coordinate ascent on the joint, with the weights of the subgoals integrated out and the parameters
-at their posterior medians, from the best draw of each chain: whole blocks of observations by the
-Viterbi algorithm, all pursuits of one subgoal at once, and subgoals of few pursuits given up.
+at their posterior medians, from the best of every hundred draws of each chain: whole blocks of
+observations by the Viterbi algorithm, all pursuits of one subgoal at once, and subgoals of few
+pursuits given up.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ from bnirl_ros.mdp.distinct import distinct
 from bnirl_ros.model.pursuits import ALPHA, ELSEWHERE, ETA, PRIORS, PursuitModel
 from bnirl_ros.threads import workers
 
+_STRETCH = 100  # draws of a chain, of which the best one is a start
 _GAIN = 1e-9  # nats; a smaller gain is rounding
 _BLOCKS = (np.int64(1024), np.int64(32))  # observations that the Viterbi algorithm takes at once
 _FEW = 4  # draws; a subgoal with more of them is not worth giving up
@@ -47,7 +49,7 @@ _NONE = np.int64(-1)  # in the place of a candidate
 
 
 def posterior_mode(model: PursuitModel, chains: Draws) -> Mode:
-    """The best pursuits that ascent reaches from the best draw of each chain.
+    """The best pursuits that ascent reaches from the best of every hundred draws of each chain.
 
     A subgoal's partition is all observations that it explains; an observation that is more
     probably a slip than not is in none.
@@ -57,15 +59,18 @@ def posterior_mode(model: PursuitModel, chains: Draws) -> Mode:
         chains: draws with leading axes (chain, draw).
     """
     parameters = np.median(chains.parameters.reshape(-1, len(PRIORS)), axis=0)
-    best = chains.log_joint.argmax(axis=1)
+    joints = chains.log_joint
+    # The best draws of chains may all lie below the same lesser mode.
+    stretches = np.array_split(np.arange(joints.shape[1]), max(1, joints.shape[1] // _STRETCH))
+    starts = [
+        (chain, stretch[joints[chain, stretch].argmax()])
+        for chain in range(len(joints))
+        for stretch in stretches
+    ]
     tables = _tables(model, parameters)
-    with workers(len(best)) as threads:
+    with workers(len(starts)) as threads:
         modes = threads.map(
-            lambda chain, draw: _ascended(
-                model, chains.subgoal_of[chain, draw], parameters, *tables
-            ),
-            range(len(best)),
-            best,
+            lambda start: _ascended(model, chains.subgoal_of[start], parameters, *tables), starts
         )
         return max(modes, key=lambda mode: mode.log_joint)
 
