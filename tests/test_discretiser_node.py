@@ -163,7 +163,8 @@ def test_from_amcl_to_subgoals_live_and_offline_are_the_same(
     )
     node = discretiser(source="/amcl_pose")
     node.until_health("both to hear it, the test and the node of the subgoals", subscribers="2")
-    arguments = (bag, "--map", DEPOT, "--fast", "--wait", "2")  # nobody hears the other topics
+    # Nobody would hear the other topics, and it waits until somebody hears all.
+    arguments = (bag, "--map", DEPOT, "--fast", "--topics", "/amcl_pose")
     assert start("replay_node", *arguments).end().status == 0
     offline, _ = read_raw_demonstration(bag, Discretising(source="/amcl_pose"), load_map(DEPOT))
     assert_as_recorded(node, offline.recording)
