@@ -160,7 +160,7 @@ class RunningPosterior:
         assert self._draws is not None
         left_out = self._kept // 4
         draws = Draws(*(values[:, left_out : self._kept] for values in vars(self._draws).values()))
-        self._middle = np.median(draws.parameters, axis=(0, 1))
+        self._middle = np.median(np.concatenate(draws.parameters), axis=0)
         burn_in = left_out * self._thin
         sampling = Sampling(self.sweeps, burn_in, self._thin, self._stopped, self._seconds)
         posterior = posterior_of(

@@ -154,7 +154,8 @@ def _enter(lane_count, neighbours, fades, row, outer, value):  # type: ignore[no
         if neighbours[row, move] < outer:
             fade = fades[move]
             other_start = np.uint64(neighbours[row, move]) * count
-            for lane in range(count):
+            for index in range(lane_count):
+                lane = np.uint64(index)
                 lent = fade * value[other_start + lane]
                 if lent > value[start + lane]:
                     value[start + lane] = lent
@@ -188,7 +189,8 @@ def _sweep(  # type: ignore[no-untyped-def]
     """
     if rows_of_goals.shape[0] == 1:
         return _sweep_of_one(law, neighbours, inner, outer, omega, wanted, value)
-    count = np.uint64(rows_of_goals.shape[0])
+    lane_count = rows_of_goals.shape[0]
+    count = np.uint64(lane_count)
     first = outer
     for row in range(inner, outer):
         start = np.uint64(row) * count
@@ -196,7 +198,8 @@ def _sweep(  # type: ignore[no-untyped-def]
         a, b, c, d = _starts(neighbours, row, 0, count)
         if len(law.fades) == 8:
             e, f, g, h = _starts(neighbours, row, 4, count)
-        for lane in range(count):
+        for index in range(lane_count):
+            lane = np.uint64(index)
             old = value[start + lane]
             total, best = _gathered(value, a + lane, b + lane, c + lane, d + lane, old, old)
             if len(law.fades) == 8:
@@ -206,12 +209,13 @@ def _sweep(  # type: ignore[no-untyped-def]
             # Written only when all is read: else the compiler would not use vectors.
             scratch[lane] = old + omega * (new - old)
         if row < goals_end:  # their own lanes are not to change
-            for lane in range(count):
+            for lane in range(lane_count):
                 if rows_of_goals[lane] == row:
                     difference = (1.0 - scratch[lane]) / omega
                     unsettled -= difference > wanted * (1.0 - difference) + LEAST
                     scratch[lane] = 1.0
-        for lane in range(count):
+        for index in range(lane_count):
+            lane = np.uint64(index)
             value[start + lane] = scratch[lane]
         if unsettled > 0 and row < first:
             first = row
