@@ -33,8 +33,8 @@ ROSDEP_KEYS = {
     "zstandard": None,
 }
 
-# Requirements that are imported under another name.
-REQUIREMENT_OF_MODULE = {"PIL": "pillow", "yaml": "pyyaml"}
+# Requirements that are imported under another name; llvmlite is numba's own compiler.
+REQUIREMENT_OF_MODULE = {"PIL": "pillow", "llvmlite": "numba", "yaml": "pyyaml"}
 
 # Packages of a ROS installation that are no messages, by the name under which they are imported.
 ROS_MODULES = {"ament_index_python", "launch", "launch_ros", "rclpy"}

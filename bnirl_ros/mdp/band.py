@@ -13,12 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from bnirl_ros.mdp.lanes import LANES, LEAST, raised_row, relaxed_row
 from bnirl_ros.mdp.wave import STRAIGHT
 
 FINEST = 2e-15
 """Changes by this factor are rounding."""
-LEAST = 1e-280
-"""Smaller values are as good as none."""
 
 _DEPTH = 40 * STRAIGHT  # the band reaches so far ahead of the cells that are settled
 _BACK = 10 * STRAIGHT  # and so far back behind the first that is not
@@ -98,33 +97,24 @@ def settle(law, neighbours, distance, rows_of_goals, tolerance, residual, wanted
         value: ((rows + 1) L,) of which the last row is kept; zero from row `outer` on.
     """
     rows, lane_count = distance.shape[0], rows_of_goals.shape[0]
-    goals_end = 0
     for lane in range(lane_count):
         value[rows_of_goals[lane] * lane_count + lane] = 1.0
-        goals_end = max(goals_end, rows_of_goals[lane] + 1)
-    scratch = np.empty(lane_count)
     inner, front, farthest, waited = 0, 0, 0, 0
     omega, enough, last = law.omega, wanted, False
     while True:
         entered = outer
         while outer < rows and distance[outer] <= distance[front] + _DEPTH:
-            _enter(lane_count, neighbours, law.fades, outer, outer, value)
+            _enter(lane_count, neighbours, law.fades, outer, value)
             outer += 1
         if entered == 0 and lane_count > 1:
-            _fill(lane_count, neighbours, law.fades, outer, value)
+            _fill(neighbours, law.fades, outer, value)
         omega_now, wanted_now = (1.0, enough) if last else (omega, wanted)
-        front = _sweep(
-            law,
-            neighbours,
-            rows_of_goals,
-            goals_end,
-            inner,
-            outer,
-            omega_now,
-            wanted_now,
-            scratch,
-            value,
-        )
+        if lane_count == 1:
+            front = _sweep_of_one(law, neighbours, inner, outer, omega_now, wanted_now, value)
+        else:
+            front = _sweep(
+                law, neighbours, rows_of_goals, inner, outer, omega_now, wanted_now, value
+            )
         if last and front == rows:
             return
         if last:
@@ -146,78 +136,43 @@ def settle(law, neighbours, distance, rows_of_goals, tolerance, residual, wanted
 
 
 @njit(nogil=True, cache=True)
-def _enter(lane_count, neighbours, fades, row, outer, value):  # type: ignore[no-untyped-def]
-    """Raise a row of values to what its neighbours before `outer` lend it."""
-    count = np.uint64(lane_count)
-    start = np.uint64(row) * count
-    for move in range(neighbours.shape[1]):
-        if neighbours[row, move] < outer:
-            fade = fades[move]
-            other_start = np.uint64(neighbours[row, move]) * count
-            for index in range(lane_count):
-                lane = np.uint64(index)
-                lent = fade * value[other_start + lane]
-                if lent > value[start + lane]:
-                    value[start + lane] = lent
+def _enter(lane_count, neighbours, fades, row, value):  # type: ignore[no-untyped-def]
+    """Raise a row of values to what its neighbours lend it; who has none yet lends none."""
+    if lane_count > 1:
+        raised_row(value, neighbours, row, fades)
+    else:
+        for move in range(neighbours.shape[1]):
+            lent = fades[move] * value[neighbours[row, move]]
+            value[row] = max(value[row], lent)
 
 
 @njit(nogil=True, cache=True)
-def _fill(lane_count, neighbours, fades, outer, value):  # type: ignore[no-untyped-def]
+def _fill(neighbours, fades, outer, value):  # type: ignore[no-untyped-def]
     """Give values to all lanes of the first rows: in most, their goal does not come first."""
-    before = lane_count * outer + 1
+    before = LANES * outer + 1
     while True:
         for row in range(outer - 1, -1, -1):
-            _enter(lane_count, neighbours, fades, row, outer, value)
+            raised_row(value, neighbours, row, fades)
         for row in range(outer):
-            _enter(lane_count, neighbours, fades, row, outer, value)
+            raised_row(value, neighbours, row, fades)
         without = 0
-        for index in range(lane_count * outer):
+        for index in range(LANES * outer):
             without += value[index] == 0.0
         if without == 0 or without >= before:
             return
         before = without
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=_NO_NAN)
-def _sweep(  # type: ignore[no-untyped-def]
-    law, neighbours, rows_of_goals, goals_end, inner, outer, omega, wanted, scratch, value
-):
+@njit(nogil=True, cache=True)
+def _sweep(law, neighbours, rows_of_goals, inner, outer, omega, wanted, value):  # type: ignore[no-untyped-def]
     """Over-relax the rows from `inner` to `outer`; returns the first that is not settled.
 
     That is one in which a value and gamma max_a E[h] differ by more than its part `wanted`;
     `outer` where there is none.
     """
-    if rows_of_goals.shape[0] == 1:
-        return _sweep_of_one(law, neighbours, inner, outer, omega, wanted, value)
-    lane_count = rows_of_goals.shape[0]
-    count = np.uint64(lane_count)
     first = outer
     for row in range(inner, outer):
-        start = np.uint64(row) * count
-        unsettled = 0
-        a, b, c, d = _starts(neighbours, row, 0, count)
-        if len(law.fades) == 8:
-            e, f, g, h = _starts(neighbours, row, 4, count)
-        for index in range(lane_count):
-            lane = np.uint64(index)
-            old = value[start + lane]
-            total, best = _gathered(value, a + lane, b + lane, c + lane, d + lane, old, old)
-            if len(law.fades) == 8:
-                total, best = _gathered(value, e + lane, f + lane, g + lane, h + lane, total, best)
-            new = law.other * total + law.chosen * best
-            unsettled += abs(new - old) > wanted * new + LEAST
-            # Written only when all is read: else the compiler would not use vectors.
-            scratch[lane] = old + omega * (new - old)
-        if row < goals_end:  # their own lanes are not to change
-            for lane in range(lane_count):
-                if rows_of_goals[lane] == row:
-                    difference = (1.0 - scratch[lane]) / omega
-                    unsettled -= difference > wanted * (1.0 - difference) + LEAST
-                    scratch[lane] = 1.0
-        for index in range(lane_count):
-            lane = np.uint64(index)
-            value[start + lane] = scratch[lane]
-        if unsettled > 0 and row < first:
+        if relaxed_row(value, neighbours, row, rows_of_goals, law, omega, wanted) and row < first:
             first = row
     return first
 
@@ -225,14 +180,12 @@ def _sweep(  # type: ignore[no-untyped-def]
 @njit(nogil=True, cache=True, error_model="numpy", fastmath=_NO_NAN)
 def _sweep_of_one(law, neighbours, inner, outer, omega, wanted, value):  # type: ignore[no-untyped-def]
     """`_sweep` of a single goal, which comes first in the order."""
-    first, one = outer, np.uint64(1)
+    first = outer
     for row in range(max(inner, 1), outer):
         old = value[row]
-        a, b, c, d = _starts(neighbours, row, 0, one)
-        total, best = _gathered(value, a, b, c, d, old, old)
+        total, best = _gathered(value, neighbours[row], 0, old, old)
         if len(law.fades) == 8:
-            a, b, c, d = _starts(neighbours, row, 4, one)
-            total, best = _gathered(value, a, b, c, d, total, best)
+            total, best = _gathered(value, neighbours[row], 4, total, best)
         new = law.other * total + law.chosen * best
         if abs(new - old) > wanted * new + LEAST and row < first:
             first = row
@@ -240,20 +193,10 @@ def _sweep_of_one(law, neighbours, inner, outer, omega, wanted, value):  # type:
     return first
 
 
-@njit(nogil=True, cache=True, inline="always")
-def _starts(neighbours, row, move, count):  # type: ignore[no-untyped-def]
-    """Where the values of four neighbours begin."""
-    return (
-        np.uint64(neighbours[row, move]) * count,
-        np.uint64(neighbours[row, move + 1]) * count,
-        np.uint64(neighbours[row, move + 2]) * count,
-        np.uint64(neighbours[row, move + 3]) * count,
-    )
-
-
 @njit(nogil=True, cache=True, inline="always", error_model="numpy", fastmath=_NO_NAN)
-def _gathered(value, a, b, c, d, total, best):  # type: ignore[no-untyped-def]
-    """Four more values added to a sum, and to a maximum."""
-    at_a, at_b, at_c, at_d = value[a], value[b], value[c], value[d]
-    total += (at_a + at_b) + (at_c + at_d)
-    return total, max(max(max(at_a, at_b), max(at_c, at_d)), best)
+def _gathered(value, neighbours, move, total, best):  # type: ignore[no-untyped-def]
+    """The values of four more neighbours added to a sum, and to a maximum."""
+    a, b = value[neighbours[move]], value[neighbours[move + 1]]
+    c, d = value[neighbours[move + 2]], value[neighbours[move + 3]]
+    total += (a + b) + (c + d)
+    return total, max(max(max(a, b), max(c, d)), best)

@@ -30,11 +30,10 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from bnirl_ros.mdp.band import FINEST, LEAST, Law, amplification, neighbours_in_order, settle
+from bnirl_ros.mdp.band import FINEST, Law, amplification, neighbours_in_order, settle
+from bnirl_ros.mdp.lanes import LANES, LEAST
 from bnirl_ros.mdp.wave import DIAGONAL, EVERYWHERE, STRAIGHT, Wave, rest, spread
 
-_MOST_LANES = 8  # goals solved together at most
-_WIDTH = 4  # and the lanes are a multiple of this, unless it is a single goal
 _TOGETHER = 40 * STRAIGHT  # goals solved together lie so near the first of them
 _MARGIN = 32 * STRAIGHT  # at first, behind what is asked for
 _BEYOND = 1.3  # h outside of what was reached is sought below so many times that at the edge
@@ -113,7 +112,7 @@ def first_passage_values(
     for goal in goals:
         if is_left[goal]:
             left_here = int((is_left[goals] & (part_of[goals] == part_of[goal])).sum())
-            near = _near(motion, goal, is_left, min(left_here, _MOST_LANES), wave)
+            near = _near(motion, goal, is_left, min(left_here, LANES), wave)
             asked_here = int((part_of[asked] == part_of[goal]).sum())
             order, value = _solve(
                 motion, law, near, tolerance, residual, is_asked, asked_here, wave
@@ -187,14 +186,14 @@ def _solve(
 
     Args:
         motion, law: how the demonstrator moves, and what follows for values.
-        goals: state numbers, near each other; there may be more lanes than goals.
+        goals: (1,) to (LANES,) state numbers, near each other.
         tolerance, residual: as above.
         is_asked: (S,) whether a state is asked for, and `asked` how many of this part of the map;
             0 for all.
         wave: one that is at rest, and will be again.
     """
     ways = motion.open_moves, motion.offsets, motion.costs
-    lanes = np.arange(-(-len(goals) // _WIDTH) * _WIDTH if len(goals) > 1 else 1)
+    lanes = np.arange(LANES if len(goals) > 1 else 1)
     goal_of_lane = goals[np.where(lanes < len(goals), lanes, 0)]
     margin = _MARGIN
     while True:
