@@ -72,6 +72,27 @@ def test_where_nothing_can_be_written_to_kernels_are_kept_with_temporary_files_a
         assert "Traceback" not in told
 
 
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_kernels_are_forgotten_when_any_source_has_changed(
+    tmp_path: Path, elsewhere: bool
+) -> None:
+    """numba looks at a kernel's own file only; what it calls may be in another one."""
+    site = tmp_path / "site"
+    source = Path(bnirl_ros.__file__).parent
+    shutil.copytree(source, site / "bnirl_ros", ignore=shutil.ignore_patterns("__pycache__"))
+    variables = {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")} if elsewhere else {}
+
+    def hits() -> str:
+        done = run(site, tmp_path / "home", **variables)
+        assert done.stderr == ""
+        return done.stdout.split()[0]
+
+    assert [hits(), hits()] == ["0", "1"]
+    with (site / "bnirl_ros" / "mdp" / "wave.py").open("a") as other:
+        other.write("\n")
+    assert [hits(), hits()] == ["0", "1"]
+
+
 def test_a_folder_that_others_write_to_is_not_trusted(tmp_path: Path) -> None:
     mine = temporary_folder(tmp_path)
     assert temporary_folder(tmp_path) == mine
