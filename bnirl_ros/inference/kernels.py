@@ -1,15 +1,26 @@
 """Small kernels that several samplers need.
 
+Two of them need what numba does not have: sums in vectors, since a sum that numba makes vectors of
+has another order on every machine, and the bits of a number. These are intrinsics, and beside each
+is what it does in plain Python.
+
 For an argument that is a literal, or a variable that begins as one, numba compiles a kernel once
 more, with all that it calls: numbers that are handed to large kernels are np.int64 from the start.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit
+import math
+from typing import Any
 
-_AT_ONCE = 256  # of the exponentials: their intermediate results stay in the nearest cache
+import numpy as np
+import numpy.typing as npt
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic, overload
+
+_SUMS = 32  # side by side: four vectors of eight
 _LEAST_EXPONENT = -700.0
 _LOG2_E = 1.4426950408889634
 _LN_2_HIGH, _LN_2_LOW = (
@@ -17,7 +28,6 @@ _LN_2_HIGH, _LN_2_LOW = (
     1.90821492927058770002e-10,
 )  # of few bits; the rest
 _ROUNDING = 6755399441055744.0  # 1.5 * 2^52
-_EXPONENT_OF_ONE = np.int64(1023 << 52)
 
 
 @njit(nogil=True, cache=True)
@@ -63,59 +73,117 @@ def count_draws(counts, subgoal_of, switched, sign):  # type: ignore[no-untyped-
 def row_sum(values):  # type: ignore[no-untyped-def]
     """The sum of values (M,), in an order that is the same on every machine.
 
-    Eight sums side by side: one alone waits for each addition before the next, and leave to change
-    the order would have it depend on the width of the machine's vectors.
+    Thirty-two sums side by side: one alone waits for each addition before the next, and leave to
+    change the order would have it depend on the width of the machine's vectors.
     """
-    count = values.shape[0]
-    whole = count // 8 * 8
-    a = b = c = d = e = f = g = h = 0.0
-    for first in range(0, whole, 8):
-        a += values[first]
-        b += values[first + 1]
-        c += values[first + 2]
-        d += values[first + 3]
-        e += values[first + 4]
-        f += values[first + 5]
-        g += values[first + 6]
-        h += values[first + 7]
-    total = ((a + e) + (c + g)) + ((b + f) + (d + h))
-    for index in range(whole, count):
-        total += values[index]
+    total = sum_of_blocks(values)
+    rest = values[values.shape[0] // _SUMS * _SUMS :]
+    a = b = c = d = 0.0
+    whole = rest.shape[0] // 4 * 4
+    for first in range(0, whole, 4):
+        a += rest[first]
+        b += rest[first + 1]
+        c += rest[first + 2]
+        d += rest[first + 3]
+    total += (a + c) + (b + d)
+    for index in range(whole, rest.shape[0]):
+        total += rest[index]
     return total
 
 
 @njit(nogil=True, cache=True)
-def exponentials(values, factor, result, scratch):  # type: ignore[no-untyped-def]
+def exponentials(values, factor, result):  # type: ignore[no-untyped-def]
     """Fill result (M,) with exp(factor * values), where that is at most 1.
 
     Within a relative 1e-14; what would be below e^-700 is that. Every step is one that is taken
-    for many values at once, which the library's exponential is not. `scratch` (M,) is overwritten.
+    for many values at once, which the library's exponential is not.
     """
-    bits = scratch.view(np.int64)
-    for first in range(0, values.shape[0], _AT_ONCE):
-        given, found = values[first : first + _AT_ONCE], result[first : first + _AT_ONCE]
-        for index in range(given.shape[0]):
-            exponent = factor * given[index]
-            exponent = exponent if exponent > _LEAST_EXPONENT else _LEAST_EXPONENT
-            found[index] = exponent
-            # Adding so large a number rounds to a whole one, which its lowest bits then are.
-            scratch[index] = exponent * _LOG2_E + _ROUNDING
-        for index in range(given.shape[0]):
-            whole = scratch[index] - _ROUNDING
-            x = (found[index] - whole * _LN_2_HIGH) - whole * _LN_2_LOW  # |x| <= ln(2) / 2
-            series = 1.0 / 39916800.0
-            series = series * x + 1.0 / 3628800.0
-            series = series * x + 1.0 / 362880.0
-            series = series * x + 1.0 / 40320.0
-            series = series * x + 1.0 / 5040.0
-            series = series * x + 1.0 / 720.0
-            series = series * x + 1.0 / 120.0
-            series = series * x + 1.0 / 24.0
-            series = series * x + 1.0 / 6.0
-            series = series * x + 0.5
-            series = series * x + 1.0
-            found[index] = series * x + 1.0
-        for index in range(given.shape[0]):
-            bits[index] = (bits[index] << 52) + _EXPONENT_OF_ONE  # two to that power
-        for index in range(given.shape[0]):
-            found[index] *= scratch[index]
+    for index in range(values.shape[0]):
+        exponent = factor * values[index]
+        exponent = exponent if exponent > _LEAST_EXPONENT else _LEAST_EXPONENT
+        # Adding so large a number rounds to a whole one, which its lowest bits then are.
+        rounded = exponent * _LOG2_E + _ROUNDING
+        whole = rounded - _ROUNDING
+        x = (exponent - whole * _LN_2_HIGH) - whole * _LN_2_LOW  # |x| <= ln(2) / 2
+        series = 1.0 / 39916800.0
+        series = series * x + 1.0 / 3628800.0
+        series = series * x + 1.0 / 362880.0
+        series = series * x + 1.0 / 40320.0
+        series = series * x + 1.0 / 5040.0
+        series = series * x + 1.0 / 720.0
+        series = series * x + 1.0 / 120.0
+        series = series * x + 1.0 / 24.0
+        series = series * x + 1.0 / 6.0
+        series = series * x + 0.5
+        series = series * x + 1.0
+        result[index] = (series * x + 1.0) * two_to_the(rounded)
+
+
+def sum_of_blocks(values: npt.NDArray[np.float64]) -> float:
+    """The sum of values (M,) but for the last M % 32: of every 32nd one first, then of those."""
+    lanes = np.zeros(_SUMS)
+    for first in range(0, len(values) // _SUMS * _SUMS, _SUMS):
+        lanes = lanes + values[first : first + _SUMS]
+    while len(lanes) > 1:
+        lanes = lanes[: len(lanes) // 2] + lanes[len(lanes) // 2 :]
+    return float(lanes[0])
+
+
+@intrinsic
+def _sum_of_blocks(typingctx, values):  # type: ignore[no-untyped-def]
+    signature = types.float64(values)
+    vector = ir.VectorType(ir.DoubleType(), 8)
+
+    def halved(build: Any, numbers: list[Any]) -> Any:
+        while len(numbers) > 1:
+            middle = len(numbers) // 2
+            pairs = zip(numbers[:middle], numbers[middle:], strict=True)
+            numbers = [build.fadd(one, other) for one, other in pairs]
+        return numbers[0]
+
+    def instructions(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
+        array = context.make_array(signature.args[0])(context, build, arguments[0])
+        count = build.extract_value(array.shape, 0)
+        size = ir.Constant(count.type, _SUMS)
+        sums = [cgutils.alloca_once_value(build, ir.Constant(vector, [0.0] * 8)) for _ in range(4)]
+        with cgutils.for_range(build, build.sdiv(count, size)) as loop:
+            first = build.gep(array.data, [build.mul(loop.index, size)])
+            first = build.bitcast(first, vector.as_pointer())
+            for place, lanes in enumerate(sums):
+                more = build.load(build.gep(first, [ir.Constant(count.type, place)]), align=8)
+                build.store(build.fadd(build.load(lanes), more), lanes)
+        lanes = halved(build, [build.load(each) for each in sums])
+        places = [ir.Constant(ir.IntType(32), lane) for lane in range(8)]
+        return halved(build, [build.extract_element(lanes, place) for place in places])
+
+    return signature, instructions
+
+
+@overload(sum_of_blocks)
+def _sum_of_blocks_of_vectors(values):  # type: ignore[no-untyped-def]
+    if values.layout == "C":  # one value behind the other
+        return lambda values: _sum_of_blocks(values)
+    return None
+
+
+def two_to_the(rounded: float) -> float:
+    """2^k for a whole number k, given as k + 1.5 * 2^52, whose lowest bits it is."""
+    return math.ldexp(1.0, int(rounded - _ROUNDING))
+
+
+@intrinsic
+def _two_to_the(typingctx, rounded):  # type: ignore[no-untyped-def]
+    signature = types.float64(types.float64)
+
+    def instructions(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
+        bits = build.bitcast(arguments[0], ir.IntType(64))
+        exponent = build.shl(bits, ir.Constant(bits.type, 52))
+        exponent = build.add(exponent, ir.Constant(bits.type, 1023 << 52))
+        return build.bitcast(exponent, ir.DoubleType())
+
+    return signature, instructions
+
+
+@overload(two_to_the)
+def _two_to_the_by_its_bits(rounded):  # type: ignore[no-untyped-def]
+    return lambda rounded: _two_to_the(rounded)

@@ -316,7 +316,7 @@ def softmax_table(model, alpha):  # type: ignore[no-untyped-def]
 @njit(nogil=True, cache=True)
 def _fill_softmax_table(model, alpha, table):  # type: ignore[no-untyped-def]
     states, actions, candidates = model.cost.shape
-    unobserved, total, scratch = np.empty(candidates), np.empty(candidates), np.empty(candidates)
+    unobserved, total = np.empty(candidates), np.empty(candidates)
     first = end = 0  # of the pairs of a state, which are in the order of their actions
     for state in range(states):
         first = end
@@ -330,7 +330,7 @@ def _fill_softmax_table(model, alpha, table):  # type: ignore[no-untyped-def]
             ):
                 row = table[end]
                 end += 1
-            exponentials(model.cost[state, action], -alpha, row, scratch)
+            exponentials(model.cost[state, action], -alpha, row)
             for candidate in range(candidates):
                 total[candidate] += row[candidate]
         for candidate in range(candidates):
@@ -1069,10 +1069,10 @@ def _log_of_costs(alpha, slip, evidence):  # type: ignore[no-untyped-def]
     """Log probability of the actions by alpha."""
     costs = evidence.costs
     taken, weights = np.empty(costs.shape[1]), np.empty(costs.shape[1])
-    scratch, total = np.empty(costs.shape[1]), np.zeros(costs.shape[1])
-    exponentials(costs[0], -alpha, taken, scratch)
+    total = np.zeros(costs.shape[1])
+    exponentials(costs[0], -alpha, taken)
     for action in range(1, costs.shape[0]):
-        exponentials(costs[action], -alpha, weights, scratch)
+        exponentials(costs[action], -alpha, weights)
         for row in range(weights.shape[0]):
             total[row] += weights[row]
     density = 0.0

@@ -169,6 +169,11 @@ def _raised_row(typingctx, value, neighbours, row, fades):  # type: ignore[no-un
     return signature, instructions
 
 
+def _are_rows(value: Any, neighbours: Any) -> bool:
+    """Whether they are types of arrays whose rows lie one behind the other, as is taken above."""
+    return bool(value.layout == "C" and neighbours.layout == "C")
+
+
 @overload(relaxed_row)
 def _relaxed_row_of_vectors(value, neighbours, row, rows_of_goals, law, omega, wanted):  # type: ignore[no-untyped-def]
     def relaxed(value, neighbours, row, rows_of_goals, law, omega, wanted):  # type: ignore[no-untyped-def]
@@ -185,7 +190,7 @@ def _relaxed_row_of_vectors(value, neighbours, row, rows_of_goals, law, omega, w
             LEAST,
         )
 
-    return relaxed
+    return relaxed if _are_rows(value, neighbours) and rows_of_goals.layout == "C" else None
 
 
 @overload(raised_row)
@@ -193,4 +198,4 @@ def _raised_row_of_vectors(value, neighbours, row, fades):  # type: ignore[no-un
     def raised(value, neighbours, row, fades):  # type: ignore[no-untyped-def]
         _raised_row(value, neighbours, np.uint64(row), fades)
 
-    return raised
+    return raised if _are_rows(value, neighbours) else None
