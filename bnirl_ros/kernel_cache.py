@@ -16,6 +16,7 @@ import os
 import stat
 import sys
 import warnings
+from contextlib import suppress
 from pathlib import Path
 
 _VARIABLE = "NUMBA_CACHE_DIR"
@@ -87,12 +88,14 @@ def forget_stale_kernels(package: Path, place: Path) -> None:
 def temporary_folder(parent: Path) -> Path:
     """A folder that nobody else writes to: whoever does could have us run anything."""
     folder = parent / f"bnirl_ros-{os.getuid()}"
-    folder.mkdir(mode=0o700, exist_ok=True)
+    # Its name is foretold, so that kernels are found again: somebody may have been there before.
+    with suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
     found = folder.lstat()
     others = stat.S_IWGRP | stat.S_IWOTH
     if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & others:
         return folder
-    import tempfile
+    import tempfile  # makes a folder of a new name, for us alone
 
     return Path(tempfile.mkdtemp(prefix="bnirl_ros-", dir=parent))
 

@@ -12,7 +12,10 @@ PACKAGE = Path(__file__).resolve().parent.parent / "bnirl_ros"
 
 # Rooms of one row see each other and those of all rows before; see docs/architecture.md.
 ORDER = [
-    {"errors", "kernel_cache", "limits", "resources", "threads"},
+    {
+        *("confinement", "errors", "kernel_cache", "limits", "resources", "safe_yaml"),
+        *("terminal_text", "threads"),
+    },
     {"mdp"},
     {"maps"},
     {"demonstrations"},

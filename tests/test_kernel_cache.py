@@ -103,3 +103,11 @@ def test_a_folder_that_others_write_to_is_not_trusted(tmp_path: Path) -> None:
     mine.rmdir()
     mine.symlink_to(another)
     assert temporary_folder(tmp_path) not in (mine, another)
+    # What leads nowhere, and what is no folder, may have been put there as well.
+    mine.unlink()
+    mine.symlink_to(tmp_path / "nowhere")
+    assert temporary_folder(tmp_path) not in (mine, tmp_path / "nowhere")
+    assert not (tmp_path / "nowhere").exists()
+    mine.unlink()
+    mine.touch()
+    assert temporary_folder(tmp_path).is_dir()

@@ -24,7 +24,7 @@ from launch_support import ROOT, Started, declared, started
 rclpy = pytest.importorskip("rclpy", reason="the nodes' tables need rclpy")
 
 from bnirl_ros.nodes import discretiser_node, subgoal_node  # noqa: E402
-from bnirl_ros.nodes.managed import AUTOSTART, DIAGNOSTICS  # noqa: E402
+from bnirl_ros.nodes.managed import DIAGNOSTICS, with_common  # noqa: E402
 from bnirl_ros.nodes.parameters import declare, parameter_of  # noqa: E402
 from bnirl_ros.nodes.replay_options import parse  # noqa: E402
 
@@ -34,11 +34,9 @@ RVIZ_FILE = ROOT / "rviz" / "subgoals.rviz"
 LAYOUT_FILE = ROOT / "foxglove" / "subgoals.json"
 
 PARAMETERS = {
-    "discretiser_node": (AUTOSTART, *discretiser_node.PARAMETERS),
-    "subgoal_node": (
-        AUTOSTART,
-        *subgoal_node.PARAMETERS,
-        *(parameter_of(setting) for setting in fields(Settings)),
+    "discretiser_node": with_common(discretiser_node.PARAMETERS),
+    "subgoal_node": with_common(
+        [*subgoal_node.PARAMETERS, *(parameter_of(setting) for setting in fields(Settings))]
     ),
 }
 """All parameters of each managed node."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import shutil
 import signal
 import time
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
 from demonstration_support import (
     CORNERS,
@@ -118,6 +120,76 @@ def test_a_manager_takes_the_node_through_its_life(
     assert change(node, "deactivate")
     assert change(node, "shutdown")
     assert state(node) == "finalized"
+    assert_silent_end(node.process, signal.SIGINT)
+
+
+def test_what_the_network_names_stays_in_the_file_folder(
+    start: StartNode, peer: Peer, tmp_path: Path
+) -> None:
+    folder, outside = tmp_path / "folder", tmp_path / "outside"
+    for each in (folder, outside):
+        each.mkdir()
+        Image.new("L", (20, 20), 1).save(each / "rooms.png")
+        (each / "rooms.yaml").write_text(
+            "{image: rooms.png, resolution: 1.0, origin: [-5.0, -5.0, 0.0]}"
+        )
+    (folder / "link").symlink_to(outside)
+    (folder / "linked.yaml").symlink_to(outside / "rooms.yaml")
+    text = (folder / "rooms.yaml").read_text()
+    (folder / "leads_out.yaml").write_text(text.replace("rooms.png", str(outside / "rooms.png")))
+    given = outside / "rooms.yaml"
+    parameters = {**QUICK, "autostart": False, "file_folder": folder, "features": given}
+    node = Subgoals(start("subgoal_node", *as_arguments(parameters)), peer)
+    node.until_health("its state", state="unconfigured")
+
+    elsewhere = [
+        str(outside / "rooms.txt"),
+        f"{folder}/../outside/rooms.yaml",
+        f"{folder}/link/rooms.yaml",
+        f"{folder}/linked.yaml",
+        f"{folder}2/rooms.yaml",
+        "rooms.yaml",  # in the working directory
+        "~/rooms.yaml",
+    ]
+    for name in ("features", "waypoints_file", "result_folder"):
+        for value in elsewhere:
+            (refused,) = node.set(**{name: value})
+            assert not refused.successful, (name, value)
+            assert f"is outside of {folder}" in refused.reason
+    (read_only,) = node.set(file_folder="/")
+    assert not read_only.successful
+
+    # What it was given at the start it keeps, and may be given again.
+    assert change(node, "configure")
+    assert change(node, "cleanup")
+    (again,) = node.set(features=str(given))
+    assert again.successful
+    # A file inside must not lead out by the image that it names, nor by a link of later.
+    (named,) = node.set(features=str(folder / "leads_out.yaml"))
+    assert named.successful
+    assert not change(node, "configure")
+    assert f"leads_out.yaml: 'image': '{outside}/rooms.png' is outside of" in node.process.err
+    results = folder / "results"
+    (named,) = node.set(features=str(folder / "rooms.yaml"))
+    assert named.successful
+    assert change(node, "configure")
+    assert change(node, "cleanup")
+    changed = node.set(features="", result_folder=str(results))
+    assert [each.successful for each in changed] == [True, True]
+    assert change(node, "configure")
+    assert change(node, "activate")
+    node.meet()
+    node.send([map_of_grid()], walk())
+    node.until_settled(OBSERVATIONS_OF_WALK)
+    assert node.call("infer").success
+    assert (results / "subgoals.json").is_file()
+    shutil.rmtree(results)
+    results.symlink_to(outside)
+    refused = node.call("infer")
+    assert not refused.success
+    assert "result_folder" in refused.message
+    assert "is outside of" in refused.message
+    assert not (outside / "subgoals.json").exists()
     assert_silent_end(node.process, signal.SIGINT)
 
 

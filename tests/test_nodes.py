@@ -65,7 +65,7 @@ from ros_support import (
 )
 
 from bnirl_ros.nodes.conversion import message_class, to_ros  # isort: skip  # needs rclpy
-from bnirl_ros.nodes.managed import AUTOSTART  # isort: skip
+from bnirl_ros.nodes.managed import with_common  # isort: skip
 from bnirl_ros.nodes.parameters import INFERRED, parameter_of  # isort: skip
 from bnirl_ros.nodes.subgoal_node import INPUTS, OUTPUTS, PARAMETERS  # isort: skip
 
@@ -526,7 +526,7 @@ def test_a_flood_of_messages_is_taken_in_whole_while_inference_runs(
 
 def test_parameters_are_described(subgoals: Callable[..., Subgoals]) -> None:
     node = subgoals()
-    table = [AUTOSTART, *map(parameter_of, fields(Settings)), *PARAMETERS]
+    table = with_common([*map(parameter_of, fields(Settings)), *PARAMETERS])
     expected = {entry.name: entry.limits for entry in table}
     defaults = {entry.name: entry.default for entry in table}
     names = list(expected)
@@ -551,7 +551,7 @@ def test_parameters_are_described(subgoals: Callable[..., Subgoals]) -> None:
             assert bounds.from_value == max(limits.lowest, limits.above)
             assert bounds.to_value == min(limits.highest, limits.below, bounds.to_value)
             assert each.additional_constraints == limits.range_in_words()
-        assert each.read_only == (name == AUTOSTART.name)
+        assert each.read_only == (name in ("autostart", "file_folder"))
 
 
 def test_parameters_can_be_set_and_bad_values_are_refused_with_a_reason(

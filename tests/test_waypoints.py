@@ -165,7 +165,7 @@ def test_a_file_of_the_panel_itself_is_read_in_its_order(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
-        ("[", "this is not valid YAML at line 1"),
+        ("[", "this is not valid YAML at line 2"),
         ("a word", "this YAML holds no keys"),
         ("frame_id: map", "has no waypoints under the key 'waypoints'"),
         ("waypoints: {}", "has no waypoints under the key 'waypoints'"),

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bnirl_ros.errors import InputError
+from bnirl_ros.safe_yaml import load_yaml
 
 QOS_KEY, HASH_KEY = "offered_qos_profiles", "topic_type_hash"
 """Under which a channel's metadata have its publishers' QoS, and its type's hash."""
@@ -138,12 +139,9 @@ def _override(place: str, policies: Any) -> dict[str, Any]:
 
 def parse_yaml(text: str) -> Any:
     """The value of a YAML text, or None where it is no YAML."""
-    import yaml  # slow to import, and not every bag has any
-
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        return yaml.load(text, Loader=loader)
-    except (yaml.YAMLError, ValueError, RecursionError):
+        return load_yaml(text)
+    except InputError:
         return None
 
 

@@ -217,8 +217,9 @@ def _listed_files(folder: Path) -> tuple[dict[Path, int | None], str | None]:
 
 
 def _file_called(name: str, folder: Path) -> Path:
-    """The file that metadata.yaml means by a name."""
-    file = folder / name
+    """The file that metadata.yaml means by a name, in the bag's own folder: it may be anybody's."""
+    leads_out = Path(name).is_absolute() or ".." in Path(name).parts
+    file = folder / (Path(name).name if leads_out else name)
     # Early versions wrote the folder's name before that of the file; and what was compressed as a
     # whole may have been unpacked since, or the other way round.
     candidates = [file, folder / file.name]

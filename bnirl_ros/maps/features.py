@@ -112,11 +112,15 @@ def with_features(grid_map: GridMap, layer: FeatureLayer) -> GridMap:
     return replace(grid_map, features=layer.features_of(grid_map))
 
 
-def load_features(path: str | Path) -> FeatureLayer:
+def load_features(path: str | Path, within: Path | None = None) -> FeatureLayer:
     """The features in a file of one of the three kinds.
 
+    Args:
+        path: the file.
+        within: a folder out of which the file must not lead by naming an image.
+
     Raises:
-        InputError: the file cannot be read, or is none of the kinds.
+        InputError: the file cannot be read, is none of the kinds, or leads out of the folder.
     """
     file = Path(path)
     suffix = file.suffix.lower()
@@ -132,7 +136,7 @@ def load_features(path: str | Path) -> FeatureLayer:
         "write it as docs/features.md shows",
         "features have either places, or image, resolution and origin",
     )
-    return _places(content, file) if "places" in content else _labels(content, file)
+    return _places(content, file) if "places" in content else _labels(content, file, within)
 
 
 def _read_numbers(file: Path) -> LabelLayer:
@@ -154,12 +158,12 @@ def _read_numbers(file: Path) -> LabelLayer:
     return LabelLayer(labels, None, {}, str(file))
 
 
-def _labels(content: Mapping[str, Any], file: Path) -> LabelLayer:
+def _labels(content: Mapping[str, Any], file: Path, within: Path | None) -> LabelLayer:
     resolution, origin = number_of(content, "resolution", file), origin_of(content, file)
     names = content.get("labels") or {}
     if not isinstance(names, Mapping) or not all(isinstance(label, int) for label in names):
         raise InputError(f"{file}: 'labels' is {names!r}; it must be like {{1: kitchen}}")
-    image_path = image_path_of(content, file)
+    image_path = image_path_of(content, file, within)
     labels = read_image(
         image_path, resolution, origin, file, lambda image: _grey_levels(image, image_path, file)
     )[::-1]

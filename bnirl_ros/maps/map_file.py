@@ -9,8 +9,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+from bnirl_ros.confinement import inside
 from bnirl_ros.errors import InputError
 from bnirl_ros.maps.occupancy import check_geometry
+from bnirl_ros.safe_yaml import load_yaml
 
 _Content = TypeVar("_Content")
 
@@ -26,19 +28,14 @@ def read_keys(path: Path, remedy: str, needed: str) -> Mapping[str, Any]:
     Raises:
         InputError: the file cannot be read, or holds no keys.
     """
-    import yaml
-
     try:
-        content = yaml.safe_load(path.read_bytes())
+        content = load_yaml(path.read_bytes())
     except OSError as error:
         raise InputError(
             f"{path}: the file cannot be read ({error.strerror}); check the path"
         ) from None
-    # PyYAML lets ValueError through for impossible dates, RecursionError for deep nesting.
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        mark = getattr(error, "problem_mark", None)
-        place = f" at line {mark.line + 1}, column {mark.column + 1}" if mark else ""
-        raise InputError(f"{path}: this is not valid YAML{place}; {remedy}") from None
+    except InputError as fault:
+        raise InputError(f"{path}: {fault}; {remedy}") from None
     if not isinstance(content, Mapping):
         raise InputError(f"{path}: this YAML holds no keys; {needed}")
     return content
@@ -82,12 +79,17 @@ def origin_of(content: Mapping[str, Any], path: Path) -> tuple[float, float, flo
     return x, y, yaw
 
 
-def image_path_of(content: Mapping[str, Any], path: Path) -> Path:
-    """Where the image lies; a relative path starts from the folder of the YAML file."""
+def image_path_of(content: Mapping[str, Any], path: Path, within: Path | None = None) -> Path:
+    """Where the image lies; a relative path starts from the folder of the YAML file.
+
+    Raises:
+        InputError: that is no path, or leads out of the folder `within`, where one is given.
+    """
     value = value_of(content, "image", path)
     if not isinstance(value, str) or not value:
         raise InputError(f"{path}: 'image' is {value!r}; it must be the path of an image")
-    return path.parent / value
+    image_path = path.parent / value
+    return image_path if within is None else inside(within, image_path, f"{path}: 'image'")
 
 
 def read_image(
@@ -111,6 +113,9 @@ def read_image(
     from PIL import Image
 
     try:
+        # A pipe would let us wait for ever.
+        if image_path.exists() and not image_path.is_file():
+            raise InputError(f"{path}: the image {image_path} is no file; correct 'image'")
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             # Only these: Pillow would run an interpreter for some other formats.

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import wraps
+from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
@@ -16,6 +17,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
+from bnirl_ros.confinement import inside, ros_folder
 from bnirl_ros.errors import InputError
 from bnirl_ros.limits import Limits
 from bnirl_ros.nodes.conversion import message_class, to_ros
@@ -36,6 +38,18 @@ AUTOSTART = NodeParameter(
 )
 """The parameter that all managed nodes have."""
 
+FILE_FOLDER = NodeParameter(
+    "file_folder",
+    "",
+    Limits(
+        "folder out of which no parameter leads that is changed while the node runs; empty: "
+        "bnirl_ros in ROS_HOME, which is ~/.ros unless it is set. What is given at the start may "
+        "lie anywhere"
+    ),
+    Changeable.NEVER,
+)
+"""The parameter of managed nodes that take names of files."""
+
 DIAGNOSTICS = NodeTopic(
     "/diagnostics",
     DiagnosticArray.TYPE,
@@ -49,6 +63,12 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 _DIAGNOSTICS_PERIOD = 1.0  # [s]
 _LOG_PERIOD = 10.0  # [s] between two words on a failure
+
+
+def with_common(table: Sequence[NodeParameter]) -> tuple[NodeParameter, ...]:
+    """All parameters of a managed node that has a table of its own."""
+    names_files = any(entry.names_file for entry in table)
+    return (AUTOSTART, *((FILE_FOLDER,) if names_files else ()), *table)
 
 
 class ManagedNode(LifecycleNode):
@@ -88,8 +108,10 @@ class ManagedNode(LifecycleNode):
         }
         self._table = table
         self._subject = subject
-        declare(self, (AUTOSTART, *table))
-        self.add_on_set_parameters_callback(self._refuse_late_changes)
+        self._naming_files = {entry.name for entry in table if entry.names_file}
+        self._given = declare(self, with_common(table))
+        self._configured_with = self._given
+        self.add_on_set_parameters_callback(self._refuse_changes)
         self._diagnostics = self.create_publisher(
             message_class(DIAGNOSTICS.type_name), DIAGNOSTICS.name, 10
         )
@@ -188,6 +210,23 @@ class ManagedNode(LifecycleNode):
                 self._told[fault] = len(str(count))
                 self.get_logger().warning(f"left out {count} x {fault}")
 
+    def file(self, name: str) -> Path | None:
+        """The file or folder that a parameter named when the node was configured, to be opened.
+
+        None if it named none. What was given at the start is taken as it is. Anything else was named by somebody on the
+        network, and must not lead out of `file_folder`: links on the way are resolved.
+
+        Raises:
+            InputError: it does, or leads nowhere.
+        """
+        return self._file_named(name, self._configured_with[name])
+
+    def confined_to(self, name: str) -> Path | None:
+        """The folder out of which the file that a parameter names must not lead; None if it may."""
+        if self._configured_with[name] == self._given[name]:
+            return None
+        return self._file_folder
+
     def stamp(self) -> int:
         """Now [ns], by the node's clock."""
         return int(self.get_clock().now().nanoseconds)
@@ -197,6 +236,7 @@ class ManagedNode(LifecycleNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Configure the node; it stays unconfigured where that cannot be done."""
         values = {entry.name: self.get_parameter(entry.name).value for entry in self._table}
+        self._configured_with = values
         outcome = self._tried("configured", lambda: self.configure(values))
         self.configured = outcome is TransitionCallbackReturn.SUCCESS
         return super().on_configure(state) if self.configured else outcome
@@ -231,6 +271,17 @@ class ManagedNode(LifecycleNode):
         """After a fault of the program in a transition: as if never configured."""
         self._end()
         return super().on_error(state)
+
+    @property
+    def _file_folder(self) -> Path:
+        return Path(self._given[FILE_FOLDER.name] or ros_folder()).expanduser()
+
+    def _file_named(self, name: str, value: str) -> Path | None:
+        if not value:
+            return None
+        if value == self._given[name]:
+            return Path(value).expanduser()
+        return inside(self._file_folder, Path(value), name)
 
     def _surviving(self, callback: Callable[..., None]) -> Callable[..., None]:
         @wraps(callback)  # rclpy looks at what it takes
@@ -280,7 +331,7 @@ class ManagedNode(LifecycleNode):
             self.faults.clear()
             self._told.clear()
 
-    def _refuse_late_changes(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+    def _refuse_changes(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         late = [each.name for each in parameters if each.name in self._taken_when_configured]
         if late and self.configured:
             return SetParametersResult(
@@ -288,6 +339,12 @@ class ManagedNode(LifecycleNode):
                 reason=f"{late[0]} is taken when the node is configured; deactivate it and clean "
                 "it up first",
             )
+        try:
+            for each in parameters:
+                if each.name in self._naming_files and isinstance(each.value, str):
+                    self._file_named(each.name, each.value)
+        except InputError as error:
+            return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _on_lost(self, event: Any) -> None:

@@ -46,12 +46,16 @@ class NodeParameter:
         default: its value where none is given; also fixes its type.
         limits: description and range.
         changeable: when it can be changed; most are taken when the node is configured.
+        names_file: whether it names a file or folder; the empty text names none. What it is
+            changed to while the node runs, which anybody on the network can do, stays inside one
+            folder.
     """
 
     name: str
     default: Any
     limits: Limits
     changeable: Changeable = Changeable.UNCONFIGURED
+    names_file: bool = False
 
 
 def parameter_of(setting: Field[Any], changeable: Changeable = Changeable.ALWAYS) -> NodeParameter:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.nodes import discretiser_node, record_node, replay_node, subgoal_node
-from bnirl_ros.nodes.managed import AUTOSTART, DIAGNOSTICS
+from bnirl_ros.nodes.managed import DIAGNOSTICS, with_common
 from bnirl_ros.nodes.parameters import NodeParameter, parameter_of
 from bnirl_ros.nodes.topics import NodeService, NodeTopic
 
@@ -180,7 +180,7 @@ def _section(page: _Page) -> str:
     first_line = page.summary.partition("\n")[0]
     parts = [f"## {page.name}\n\n{first_line}\n\n{page.notes}"]
     outputs = (*page.outputs, DIAGNOSTICS) if page.managed else page.outputs
-    parameters = (AUTOSTART, *page.parameters) if page.managed else page.parameters
+    parameters = with_common(page.parameters) if page.managed else page.parameters
     if page.inputs:
         parts.append("### Heard\n\n" + _topic_table(page.inputs))
     if outputs:

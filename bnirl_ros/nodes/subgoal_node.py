@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError
-from pathlib import Path
 from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -61,16 +60,19 @@ PARAMETERS = (
         "features",
         "",
         Limits("file with features of the map's cells, for feature subgoals; empty: none"),
+        names_file=True,
     ),
     NodeParameter(
         "waypoints_file",
         "",
         Limits("waypoints.yaml to publish until there is a posterior; empty: none"),
+        names_file=True,
     ),
     NodeParameter(
         "result_folder",
         "",
         Limits("folder for the result files of ~/infer, as of bnirl infer; empty: none"),
+        names_file=True,
     ),
 )
 """The node's own parameters; those of the inference are in `bnirl_ros.inference.settings`."""
@@ -176,11 +178,11 @@ class SubgoalNode(ManagedNode):
         self._depth: int = values["queue_depth"]
         self._result_folder: str = values["result_folder"]
         self._features: FeatureLayer | None = None
-        if values["features"]:
-            self._features = load_features(Path(values["features"]).expanduser())
+        if features := self.file("features"):
+            self._features = load_features(features, self.confined_to("features"))
         self._saved_waypoints: Waypoints | None = None
-        if values["waypoints_file"]:
-            self._saved_waypoints = read_waypoints(Path(values["waypoints_file"]).expanduser())
+        if waypoints := self.file("waypoints_file"):
+            self._saved_waypoints = read_waypoints(waypoints)
         self._outputs = self.advertise(OUTPUTS)
         self._recorder = Recorder(values["waiting_limit"])
         self._shown: dict[str, Message] = {}  # the last messages on what is pursued now
@@ -298,12 +300,13 @@ class SubgoalNode(ManagedNode):
 
     def _keep(self, result: Result) -> None:
         """Write the result files where that is wanted; called in the inference's thread."""
-        if self._result_folder:
+        folder = self.file("result_folder")  # now, since links may have been laid meanwhile
+        if folder:
             assert result.posterior is not None
             assert result.summary is not None
             assert result.settings is not None
             write_results(
-                Path(self._result_folder).expanduser(),
+                folder,
                 result.posterior,
                 result.summary,
                 result.grid_map,

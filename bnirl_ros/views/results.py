@@ -7,7 +7,7 @@ import math
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from tempfile import TemporaryFile
+from tempfile import TemporaryDirectory, TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -68,13 +68,11 @@ def write_whole(folder: Path, writers: Mapping[str, Callable[[Path], object]]) -
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, write in writers.items():
-            partial = folder / f".partial-{name}"
-            try:
-                write(partial)
-                partial.replace(folder / name)
-            finally:
-                partial.unlink(missing_ok=True)
+        # In a folder of our own nobody has laid a link that would let us write elsewhere.
+        with TemporaryDirectory(prefix=".partial-", dir=folder) as partial:
+            for name, write in writers.items():
+                write(Path(partial, name))
+                Path(partial, name).replace(folder / name)
     except OSError as error:
         raise unwritable(folder, error) from error
     return [folder / name for name in writers]
