@@ -217,7 +217,7 @@ def _listed_files(folder: Path) -> tuple[dict[Path, int | None], str | None]:
 
 
 def _file_called(name: str, folder: Path) -> Path:
-    """The file that metadata.yaml means by a name, in the bag's own folder: it may be anybody's."""
+    """The file that metadata.yaml means by a name, in the bag's folder, whoever wrote it."""
     leads_out = Path(name).is_absolute() or ".." in Path(name).parts
     file = folder / (Path(name).name if leads_out else name)
     # Early versions wrote the folder's name before that of the file; and what was compressed as a

@@ -213,8 +213,9 @@ class ManagedNode(LifecycleNode):
     def file(self, name: str) -> Path | None:
         """The file or folder that a parameter named when the node was configured, to be opened.
 
-        None if it named none. What was given at the start is taken as it is. Anything else was named by somebody on the
-        network, and must not lead out of `file_folder`: links on the way are resolved.
+        None if it named none. What was given at the start is taken as it is. Anything else was
+        named by somebody on the network, and must not lead out of `file_folder`: links on the way
+        are resolved.
 
         Raises:
             InputError: it does, or leads nowhere.
@@ -222,7 +223,7 @@ class ManagedNode(LifecycleNode):
         return self._file_named(name, self._configured_with[name])
 
     def confined_to(self, name: str) -> Path | None:
-        """The folder out of which the file that a parameter names must not lead; None if it may."""
+        """The folder out of which a parameter's file must not lead; None: it may lie anywhere."""
         if self._configured_with[name] == self._given[name]:
             return None
         return self._file_folder
