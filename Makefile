@@ -6,6 +6,8 @@ VENV ?= .venv
 PYTHON ?=
 # Further requirements for pip, such as WITH='numpy<2'.
 WITH ?=
+# Empty for the newest packages that setup.py allows, rather than those that requirements/ names.
+LOCK ?= yes
 # Further arguments for pytest, such as PYTEST_ARGS='-k bags -x'.
 PYTEST_ARGS ?=
 # How many processes run the tests; `auto` is one for each core. 0 to use a debugger.
@@ -24,7 +26,7 @@ BAGS ?= ../shared/data/bags
 TURTLE ?= ../shared/data/bags/turtle_waypoints
 
 BIN := $(VENV)/bin
-export PYTHON WITH
+export PYTHON WITH LOCK
 
 # The environment brings its own ROS 2 and must not see the caller's. A sourced ROS installation
 # would put its packages and middleware before ours, and a Python of another such environment, one
@@ -35,7 +37,8 @@ endif
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 unexport AMENT_PREFIX_PATH PYTHONPATH PYTHONHOME RMW_IMPLEMENTATION
 
-.PHONY: help demo test lint unit colcon bags reference benchmark campaigns study reproduce venv clean
+.PHONY: help demo test lint unit colcon bags reference benchmark campaigns study reproduce venv lock \
+	audit clean
 
 help:  ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -85,6 +88,12 @@ reproduce: venv  ## Run the paper's experiments, into bnirl_out/reproduction.md
 
 venv:  ## Make the virtual environment, or bring it up to date
 	@scripts/venv $(VENV)
+
+lock:  ## Write requirements/ anew, with the newest packages that setup.py allows
+	@scripts/lock
+
+audit: venv  ## Look at the packages of requirements/: do they fit, were any withdrawn, known faults
+	@scripts/audit $(VENV)
 
 clean:  ## Remove the virtual environments, caches and build results
 	rm -rf .venv .venv-* build install log dist bnirl_ros.egg-info
