@@ -37,7 +37,7 @@ endif
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 unexport AMENT_PREFIX_PATH PYTHONPATH PYTHONHOME RMW_IMPLEMENTATION
 
-.PHONY: help demo test lint unit colcon bags reference benchmark campaigns study reproduce venv lock \
+.PHONY: help demo test lint unit colcon bags reference policies benchmark campaigns study reproduce venv lock \
 	audit clean
 
 help:  ## List the targets
@@ -69,6 +69,9 @@ reference: venv  ## Write docs/reference.md, the topics and parameters of the no
 # All of them run, also where one misses its bound.
 BENCHMARKS ?= main_job start_up running load replay large_bag goal_values sequential paper_sampler \
 	convergence growth
+
+policies: venv  ## Write policies/, what each node may do where access is controlled
+	$(BIN)/python -m bnirl_ros.nodes.policies policies
 
 benchmark: venv  ## Time the main job, its parts and the node, and see how cost grows
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[benchmark]'

@@ -7,7 +7,7 @@ from setuptools import find_packages, setup
 NAME = "bnirl_ros"
 # A symlinked colcon build runs a link to this file in a folder that has no README.
 README = Path(__file__).resolve().parent / "README.md"
-SHARED_FOLDERS = ("launch", "config", "rviz", "foxglove", "bags", "msg_schemas")
+SHARED_FOLDERS = ("launch", "config", "rviz", "foxglove", "bags", "msg_schemas", "policies")
 
 # The lower bounds of what has a rosdep key are the versions of Ubuntu 24.04, on which ROS 2 Jazzy
 # runs: a colcon build there takes those.

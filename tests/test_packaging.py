@@ -170,7 +170,7 @@ def test_all_shared_files_are_installed(setup_arguments: dict[str, Any]) -> None
         Path("share/ament_index/resource_index/packages/bnirl_ros"): ROOT / "resource/bnirl_ros",
         share / "package.xml": ROOT / "package.xml",
     }
-    for name in ("launch", "config", "rviz", "foxglove", "bags", "msg_schemas"):
+    for name in ("launch", "config", "rviz", "foxglove", "bags", "msg_schemas", "policies"):
         for path in (ROOT / name).rglob("*"):
             if path.is_file() and path.suffix != ".pyc":
                 expected[share / path.relative_to(ROOT)] = path

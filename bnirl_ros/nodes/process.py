@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import rclpy
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.signals import SignalHandlerOptions
 
 from bnirl_ros.errors import InputError
@@ -37,6 +39,16 @@ def run(name: str, body: Callable[[], None], arguments: Sequence[str] | None = N
         return 0
     except InputError as error:
         print(f"{name}: {error}", file=sys.stderr)
+        return 1
+    except rclpy_implementation.RCLError as error:
+        if os.environ.get("ROS_SECURITY_ENABLE") != "true":
+            raise
+        reason = " ".join(str(error).split())
+        print(
+            f"{name}: was not let in by ROS's security ({reason}); check its enclave and its "
+            "permissions, as docs/security.md tells",
+            file=sys.stderr,
+        )
         return 1
     finally:
         _on_signals(signal.SIG_IGN)  # `ros2 launch` and the terminal both send one

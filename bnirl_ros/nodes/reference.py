@@ -116,7 +116,7 @@ be missing, and metadata.yaml is. Types are those of `msg_schemas`.
 
 
 @dataclass(frozen=True)
-class _Page:
+class NodePage:
     """What there is to tell of a node."""
 
     name: str
@@ -129,8 +129,8 @@ class _Page:
     managed: bool = True
 
 
-_PAGES = (
-    _Page(
+PAGES = (
+    NodePage(
         "subgoal_node",
         subgoal_node.SubgoalNode.__doc__ or "",
         _ON_SUBGOALS,
@@ -139,7 +139,7 @@ _PAGES = (
         subgoal_node.SERVICES,
         (*map(parameter_of, fields(Settings)), *subgoal_node.PARAMETERS),
     ),
-    _Page(
+    NodePage(
         "discretiser_node",
         discretiser_node.DiscretiserNode.__doc__ or "",
         _ON_DISCRETISING,
@@ -148,7 +148,7 @@ _PAGES = (
         (),
         discretiser_node.PARAMETERS,
     ),
-    _Page(
+    NodePage(
         "replay_node",
         replay_node.ReplayNode.__doc__ or "",
         _ON_REPLAYING,
@@ -158,7 +158,7 @@ _PAGES = (
         replay_node.PARAMETERS,
         managed=False,
     ),
-    _Page(
+    NodePage(
         "record_node",
         record_node.RecordNode.__doc__ or "",
         _ON_RECORDING,
@@ -173,10 +173,10 @@ _PAGES = (
 
 def reference() -> str:
     """The page, in Markdown."""
-    return "\n".join([_INTRODUCTION, *map(_section, _PAGES)])
+    return "\n".join([_INTRODUCTION, *map(_section, PAGES)])
 
 
-def _section(page: _Page) -> str:
+def _section(page: NodePage) -> str:
     first_line = page.summary.partition("\n")[0]
     parts = [f"## {page.name}\n\n{first_line}\n\n{page.notes}"]
     outputs = (*page.outputs, DIAGNOSTICS) if page.managed else page.outputs
