@@ -4,25 +4,38 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import dataclasses
+import json
 import os
+import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from PIL import Image
 
 from bnirl_ros.bags.inspection import inspect
 from bnirl_ros.confinement import inside, ros_folder
 from bnirl_ros.errors import InputError
-from bnirl_ros.experiments.scenarios import PAPER_LOOP
+from bnirl_ros.experiments.demonstration_bag import write_demonstration
+from bnirl_ros.experiments.scenarios import PAPER_LOOP, shipped_demonstration
 from bnirl_ros.maps import load_map
 from bnirl_ros.safe_yaml import SIZE_LIMIT, load_yaml
+from bnirl_ros.terminal_text import plain
 from bnirl_ros.views.results import write_contents
+from bnirl_ros.views.waypoint_files import read_waypoints
+from cli_support import Command
+
+if TYPE_CHECKING:
+    from ros_support import NodeProcess
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -228,3 +241,84 @@ def test_a_bag_reads_no_files_but_its_own(tmp_path: Path, name: str) -> None:
     inspection = inspect(tmp_path / "bag")
     assert [file.name for file in inspection.files] == [own]
     assert any("names other_0.mcap, which is not there" in each for each in inspection.warnings)
+
+
+# Text from bags
+
+
+HURTING = "<b>\x1b[31mred\x07\r\n\u202e\u2028$\\frac$\x9b2J"
+"""A name that is markup, a formula, and what a terminal, a log or a reader would be misled by."""
+
+CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028\u202e]")
+
+
+def hurting_bag(folder: Path) -> Path:
+    """The paper's loop in a frame of that name, with a topic of that name and type."""
+    grid_map = dataclasses.replace(PAPER_LOOP.grid_map, frame_id=HURTING)
+    write_demonstration(folder / "plain", shipped_demonstration(PAPER_LOOP), grid_map, 0.2)
+    (file,) = (folder / "plain").glob("*.mcap")
+    bag = folder / f"{HURTING}.mcap"
+    with file.open("rb") as source, bag.open("wb") as target:
+        writer = Writer(target)
+        writer.start("ros2")
+        channels: dict[int, int] = {}
+        for schema, channel, message in make_reader(source).iter_messages():
+            assert schema is not None
+            if channel.id not in channels:
+                of = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, "cdr", of)
+            times = message.log_time, message.publish_time
+            writer.add_message(channels[channel.id], *(times[:1]), message.data, times[1])
+        of = writer.register_schema(HURTING, "ros2msg", b"int32 x")
+        hurting = writer.register_channel(f"/{HURTING}", "cdr", of)
+        writer.add_message(hurting, message.log_time, b"\0\1\0\0\0\0\0\0", message.log_time)
+        writer.finish()
+    return bag
+
+
+def test_names_from_bags_do_nothing_to_a_terminal(tmp_path: Path, bnirl: Command) -> None:
+    bag, out = hurting_bag(tmp_path), tmp_path / f"out{HURTING}"
+    height, width = PAPER_LOOP.grid_map.free.shape
+    Image.new("L", (width, height), 1).save(tmp_path / "rooms.png")
+    keys = {"image": "rooms.png", "resolution": 1.0, "origin": [0, 0, 0], "labels": {1: HURTING}}
+    rooms = tmp_path / "rooms.yaml"
+    rooms.write_text(yaml.safe_dump(keys))
+    options = ["--out", out, "--sweeps", "4", "--burn-in", "2", "--report"]
+    told = [
+        bnirl("bag", "info", bag),
+        bnirl("infer", bag, *options),
+        bnirl("infer", bag, *options, "--features", rooms),
+        bnirl("infer", bag, "--each", *options),
+        bnirl("waypoints", out / "subgoals.json", "--out", out),
+        bnirl("infer", tmp_path / f"none{HURTING}"),
+        bnirl("infer", bag, "--source", HURTING),
+    ]
+    assert [each.status for each in told] == [0, 0, 0, 0, 0, 1, 1]
+    for each in told:
+        assert not CONTROL.search(each.out + each.err), each
+    assert r"<b>\x1b[31mred\x07\r\n\u202e" in told[0].out
+    assert (out / "report.html").is_file()
+    # As values they are what they were, and come back.
+    assert json.loads((out / "subgoals.json").read_text())["frame_id"] == HURTING
+    assert read_waypoints(out / "waypoints.yaml").frame_id == HURTING
+    assert json.loads((out / "waypoints.geojson").read_text())["frame_id"] == HURTING
+
+
+@given(st.text())
+def test_plain_text_has_nothing_that_acts(text: str) -> None:
+    told = plain(text)
+    assert not CONTROL.search(told)
+    assert "\n" not in told
+    told.encode()
+    if text.isprintable():
+        assert told == text
+
+
+def test_names_from_bags_do_nothing_to_the_terminal_of_a_node(
+    start: Callable[..., NodeProcess], tmp_path: Path
+) -> None:
+    pytest.importorskip("rclpy")
+    end = start("replay_node", hurting_bag(tmp_path), "--fast", "--wait", "0.1").end()
+    assert end.status == 0
+    assert not CONTROL.search((end.out + end.err).replace("\x1b[33m", "").replace("\x1b[0m", ""))
+    assert r"\x1b[31mred\x07\r\n" in end.out

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 
 from bnirl_ros import __version__
 from bnirl_ros.cli import bag, demo, infer, predict, record, replay, reproduce, waypoints
+from bnirl_ros.cli.terminal import warn
 from bnirl_ros.errors import InputError
 
 COMMANDS = (bag, infer, predict, waypoints, reproduce, replay, record, demo)
@@ -34,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = parser().parse_args(_joined(given))
         return int(options.run(options))
     except InputError as error:
-        print(f"bnirl: {error}", file=sys.stderr)
+        warn(str(error))
         return 1
     except KeyboardInterrupt:
         print("bnirl: stopped", file=sys.stderr)

@@ -6,8 +6,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bnirl_ros.cli.terminal import warn
+from bnirl_ros.cli.terminal import say, warn
 from bnirl_ros.errors import InputError
+from bnirl_ros.terminal_text import plain
 
 if TYPE_CHECKING:
     from bnirl_ros.bags.inspection import Inspection
@@ -56,7 +57,7 @@ def _info(options: argparse.Namespace) -> int:
             warn(str(refusal))
             status = 1
             continue
-        print("\n" * bool(number) + _told(inspection), flush=True)
+        say("\n" * bool(number) + _told(inspection))
         for warning in inspection.warnings:
             warn(warning)
         if inspection.damage:
@@ -72,18 +73,18 @@ def _told(inspection: Inspection) -> str:
     from bnirl_ros.views.tables import topic_table
 
     files = ", ".join(file.name for file in inspection.files)
-    lines = [f"{inspection.path}: {inspection.messages} messages in {files}"]
+    lines = [plain(f"{inspection.path}: {inspection.messages} messages in {files}")]
     if inspection.start is not None and inspection.end is not None:
         seconds = (inspection.end - inspection.start) / 1e9
         start, end = _date(inspection.start), _date(inspection.end)
         lines.append(f"{seconds:.3f} s, from {start} to {end}")
     lines.append(topic_table(inspection.topics, inspection.motion))
-    lines.append(f"bnirl infer takes {'; '.join(inspection.use)}")
-    lines += [f"missing: {words}" for words in inspection.lacks]
+    lines.append(plain(f"bnirl infer takes {'; '.join(inspection.use)}"))
+    lines += [plain(f"missing: {words}") for words in inspection.lacks]
     skipped = [(topic, why_not_read(topic)) for topic in inspection.topics]
     reasons = [f"{topic.name} {topic.messages} ({why})" for topic, why in skipped if why]
     if reasons:
-        lines.append(f"not for bnirl to decode, by messages: {', '.join(reasons)}")
+        lines.append(plain(f"not for bnirl to decode, by messages: {', '.join(reasons)}"))
     return "\n".join(lines)
 
 
@@ -105,13 +106,13 @@ def _repair(options: argparse.Namespace) -> int:
     repaired = repair(options.bag, options.out)
     for warning in repaired.warnings:
         warn(warning)
-    print(f"Written: {repaired.out}, {repaired.messages} messages on {repaired.topics} topics")
+    say(f"Written: {repaired.out}, {repaired.messages} messages on {repaired.topics} topics")
     if repaired.left_out:
-        print(f"Left out: {repaired.left_out} messages with a time that no bag can hold")
+        say(f"Left out: {repaired.left_out} messages with a time that no bag can hold")
     if repaired.damage is None:
-        print("Lost: nothing, the bag was sound")
+        say("Lost: nothing, the bag was sound")
     else:
-        print(f"Lost: {_lost(repaired.expected, repaired.messages)}: {repaired.damage}")
+        say(f"Lost: {_lost(repaired.expected, repaired.messages)}: {repaired.damage}")
     return 0
 
 

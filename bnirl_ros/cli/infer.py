@@ -18,6 +18,7 @@ from bnirl_ros.cli.inference import (
     told_of,
 )
 from bnirl_ros.cli.many import add_many, infer_many
+from bnirl_ros.cli.terminal import say
 
 
 def add(commands: Any) -> None:
@@ -61,10 +62,10 @@ def _infer(options: argparse.Namespace) -> int:
     summary = summarise(posterior, grid_map)
     title = title_of(options.demonstrations) if options.report else None
     try:  # first what was found: to import what draws the picture takes longer than to infer
-        print(report(summary))
+        say(report(summary))
         print_rate(posterior)
         sys.stdout.flush()
     finally:  # also where nobody reads on
         written = write_results(options.out, posterior, summary, grid_map, settings, title)
-    print(f"Written: {', '.join(str(file) for file in written)}")
+    say(f"Written: {', '.join(str(file) for file in written)}")
     return told_of(damage)

@@ -8,7 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from bnirl_ros.cli.terminal import progress_bar, warn
+from bnirl_ros.cli.terminal import progress_bar, say, warn
 from bnirl_ros.errors import InputError
 
 if TYPE_CHECKING:
@@ -189,7 +189,7 @@ def told(remark: Remark) -> None:
     if remark.is_warning:
         warn(remark.sentence)
     else:
-        print(remark.sentence)
+        say(remark.sentence)
 
 
 def inferred(demonstration: Demonstration, grid_map: GridMap, settings: Settings) -> Posterior:
@@ -200,7 +200,7 @@ def inferred(demonstration: Demonstration, grid_map: GridMap, settings: Settings
     with progress_bar("Sampling", total, before="Solving the goals") as progress:
         posterior = infer(demonstration, grid_map, settings, progress)
     if posterior.settings.thin != settings.thin:
-        print(
+        say(
             f"Kept one draw in {posterior.settings.thin} sweeps, so that the draws of "
             f"{len(demonstration)} observations fit into 1 GiB"
         )
@@ -214,7 +214,7 @@ def print_rate(posterior: Posterior) -> None:
     if rate is not None:
         number = format(rate, ",.0f" if rate >= 10.0 else ".2g")
         words += f": {number} effective samples a second, of {posterior.convergence.ess_of}"
-    print(words)
+    say(words)
 
 
 def told_of(damage: str | None) -> int:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bnirl_ros.cli.inference import in_spite_of, inferred, map_of, print_rate, reading_of, told
-from bnirl_ros.cli.terminal import progress_bar, warn
+from bnirl_ros.cli.terminal import progress_bar, say, warn
 from bnirl_ros.errors import InputError
 from bnirl_ros.limits import one_or_more
 
@@ -76,8 +76,8 @@ def infer_many(
     infer_from_all = _infer_each if options.each else _infer_pooled
     accounts, written = infer_from_all(options, settings, reading, features)
     written += write_account(options.out, accounts, pooled=not options.each)
-    print(account_table(accounts, pooled=not options.each))
-    print(f"Written: {', '.join(str(file) for file in written)}")
+    say(account_table(accounts, pooled=not options.each))
+    say(f"Written: {', '.join(str(file) for file in written)}")
     status = 0
     for account in accounts:
         fault = account.error or (account.damage and in_spite_of(account.damage))
@@ -183,7 +183,7 @@ def _infer_pooled(
     summary = summarise(posterior, grid_map)
     title = title_of([paths[number] for number in placed]) if options.report else None
     written = write_results(options.out, posterior, summary, grid_map, settings, title)
-    print(report(summary))
+    say(report(summary))
     print_rate(posterior)
     start = 0
     for number, each in placed.items():

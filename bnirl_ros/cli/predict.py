@@ -17,7 +17,7 @@ from bnirl_ros.cli.inference import (
     settings_of,
     told_of,
 )
-from bnirl_ros.cli.terminal import warn
+from bnirl_ros.cli.terminal import say, warn
 from bnirl_ros.errors import InputError
 
 if TYPE_CHECKING:
@@ -94,13 +94,13 @@ def _predict(options: argparse.Namespace) -> int:
     everything = [_foreseen(posterior, *other, grid_map) for other in others]
     written = write_predictions(options.out, everything, posterior.candidates)
     if options.held_out:
-        print(loss_table(_losses(posterior, everything, grid_map)))
-        print(_how_much(everything))
+        say(loss_table(_losses(posterior, everything, grid_map)))
+        say(_how_much(everything))
     else:
-        print(cell_table(everything[0], posterior.candidates, grid_map))
-    print(f"learnt from {convergence(summarise(posterior, grid_map))}")
-    print(verdict(posterior.convergence, posterior.sampling))
-    print(f"Written: {', '.join(str(file) for file in written)}")
+        say(cell_table(everything[0], posterior.candidates, grid_map))
+    say(f"learnt from {convergence(summarise(posterior, grid_map))}")
+    say(verdict(posterior.convergence, posterior.sampling))
+    say(f"Written: {', '.join(str(file) for file in written)}")
     return told_of(damage)
 
 

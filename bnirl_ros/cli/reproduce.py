@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from bnirl_ros.cli.terminal import progress_bar
+from bnirl_ros.cli.terminal import progress_bar, say
 
 REPRODUCIBLE = ("4.1", "4.2", "4.3", "table1", "all")
 """What can be asked for."""
@@ -73,6 +73,6 @@ def _reproduce(options: argparse.Namespace) -> int:
         processes=options.jobs,
     )
     report = reproduce(plan, options.out, progress_bar)
-    print(short(report.claims))
-    print(f"Written: {', '.join(str(options.out / name) for name in files_of(report))}")
+    say(short(report.claims))
+    say(f"Written: {', '.join(str(options.out / name) for name in files_of(report))}")
     return 0

@@ -6,6 +6,8 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from bnirl_ros.terminal_text import plain, plain_lines
+
 
 @contextmanager
 def progress_bar(
@@ -50,5 +52,11 @@ def progress_bar(
         yield advance
 
 
+def say(text: str) -> None:
+    """Print lines in which names may be from anywhere, and do nothing to the terminal."""
+    print(plain_lines(text), flush=True)
+
+
 def warn(sentence: str) -> None:
-    print(f"bnirl: {sentence}", file=sys.stderr)
+    """Print a sentence on standard error, whatever names are in it."""
+    print(plain(f"bnirl: {sentence}"), file=sys.stderr)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from bnirl_ros.cli.terminal import warn
+from bnirl_ros.cli.terminal import say, warn
 from bnirl_ros.errors import InputError
 
 
@@ -53,6 +53,6 @@ def _waypoints(options: argparse.Namespace) -> int:
             f"{written[0]}: is in the frame {visits.frame_id}; Nav2's RViz panel, which reads no "
             f"frame, would take it to be in {PANEL_FRAME}"
         )
-    print(f"Waypoints in the frame {visits.frame_id}: {len(visits.subgoals)}")
-    print(f"Written: {', '.join(str(file) for file in written)}")
+    say(f"Waypoints in the frame {visits.frame_id}: {len(visits.subgoals)}")
+    say(f"Written: {', '.join(str(file) for file in written)}")
     return 0

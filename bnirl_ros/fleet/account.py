@@ -78,7 +78,7 @@ def write_account(folder: Path, accounts: Sequence[Account], pooled: bool) -> li
 
 def _write_csv(path: Path, rows: Iterable[dict[str, Any]]) -> None:
     """A line for each; of what was left out, how much it was in all."""
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         table = csv.DictWriter(file, [each.name for each in fields(Account)])
         table.writeheader()
         for row in rows:

@@ -34,6 +34,7 @@ from bnirl_ros.nodes.managed import LATCHED, ManagedNode, publish, serve
 from bnirl_ros.nodes.parameters import Changeable, NodeParameter, parameter_of
 from bnirl_ros.nodes.topics import NodeTopic
 from bnirl_ros.nodes.transforms import LiveTransforms, tf_is_installed
+from bnirl_ros.terminal_text import plain
 from bnirl_ros.views.belief import map_message
 from bnirl_ros.views.demonstration import visit_messages
 from bnirl_ros.views.diagnostics import Health
@@ -269,7 +270,9 @@ class DiscretiserNode(ManagedNode):
             return None
         if len(candidates) > 1:
             others = ", ".join(topic for topic, _ in candidates[1:])
-            self.get_logger().info(f"{others} would do, too; name one with the parameter source")
+            self.get_logger().info(
+                plain(f"{others} would do, too; name one with the parameter source")
+            )
         return candidates[0]
 
     def _may_follow(self, topic: str, type_name: str) -> bool:
@@ -289,7 +292,7 @@ class DiscretiserNode(ManagedNode):
     def _refuse(self, role: str, reason: str) -> None:
         if self._refusals.get(role) != reason:
             self._refusals[role] = reason
-            self.get_logger().error(reason)
+            self.get_logger().error(plain(reason))
 
     def _hear_motion(self, role: str, topic: str, type_name: str) -> None:
         """Hear a topic by the best QoS that all its publishers offer."""
@@ -302,7 +305,7 @@ class DiscretiserNode(ManagedNode):
             self.hear(topic, type_name, self._on_intent, qos)
             return
         self._followed = f"{topic} ({type_name})"
-        self.get_logger().info(f"follows {self._followed}")
+        self.get_logger().info(plain(f"follows {self._followed}"))
         if type_name == TF:
             self._tick = self.every(_TICK_PERIOD, self._on_tf_tick)
         elif type_name in COMMAND_TYPES:
@@ -385,7 +388,7 @@ class DiscretiserNode(ManagedNode):
 
     def _tell(self, news: News) -> None:
         for warning in news.warnings:
-            self.get_logger().warning(warning)
+            self.get_logger().warning(plain(warning))
         if news.grid_map:
             publish(self._outputs["planning_map"], map_message(news.grid_map, self.stamp()))
         for visit in news.visits:

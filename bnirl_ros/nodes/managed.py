@@ -24,6 +24,7 @@ from bnirl_ros.nodes.conversion import message_class, to_ros
 from bnirl_ros.nodes.parameters import Changeable, NodeParameter, declare
 from bnirl_ros.nodes.process import run, spin
 from bnirl_ros.nodes.topics import NodeTopic
+from bnirl_ros.terminal_text import plain
 from bnirl_ros.views.diagnostics import Health, diagnostic_array
 from bnirl_ros.views.messages import DiagnosticArray, Message
 
@@ -208,7 +209,7 @@ class ManagedNode(LifecycleNode):
         for fault, count in faults.items():
             if count and len(str(count)) > self._told.get(fault, 0):
                 self._told[fault] = len(str(count))
-                self.get_logger().warning(f"left out {count} x {fault}")
+                self.get_logger().warning(plain(f"left out {count} x {fault}"))
 
     def file(self, name: str) -> Path | None:
         """The file or folder that a parameter named when the node was configured, to be opened.
@@ -292,7 +293,7 @@ class ManagedNode(LifecycleNode):
             except Exception as error:
                 self.faults["message on which the node failed"] += 1
                 self.get_logger().error(
-                    f"failed on a message: {type(error).__name__}: {error}",
+                    plain(f"failed on a message: {type(error).__name__}: {error}"),
                     throttle_duration_sec=_LOG_PERIOD,
                 )
 
@@ -305,11 +306,11 @@ class ManagedNode(LifecycleNode):
         except InputError as error:
             self._failure = str(error)
             if not self._is_starting:
-                self.get_logger().error(f"cannot be {done}: {error}")
+                self.get_logger().error(plain(f"cannot be {done}: {error}"))
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
             self._failure = f"cannot be {done}: {type(error).__name__}: {error}"
-            self.get_logger().error(self._failure)
+            self.get_logger().error(plain(self._failure))
             return TransitionCallbackReturn.ERROR
         return TransitionCallbackReturn.SUCCESS
 

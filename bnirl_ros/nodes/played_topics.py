@@ -20,6 +20,7 @@ from bnirl_ros.maps import load_map
 from bnirl_ros.nodes.conversion import is_installed, message_class, to_ros
 from bnirl_ros.nodes.qos import joint_offer, qos_profile
 from bnirl_ros.nodes.replay_options import Options
+from bnirl_ros.terminal_text import plain
 from bnirl_ros.views.belief import map_message
 
 _DEPTH = 1000  # of a reliable publisher at least that plays at a pace
@@ -85,7 +86,7 @@ class PlayedTopics:
             else:
                 self._announce(topic)
         for fault in _unknown_names(options, topics):
-            node.get_logger().warning(fault)
+            node.get_logger().warning(plain(fault))
         if options.grid_map:
             self._publish_map(options.grid_map)
 
@@ -166,7 +167,7 @@ class PlayedTopics:
 
     def _skip(self, topic: Topic, why: str) -> None:
         self.skipped[topic.name] = why
-        self._node.get_logger().warning(f"{topic.name} is not sent: {why}")
+        self._node.get_logger().warning(plain(f"{topic.name} is not sent: {why}"))
 
     def _publish_map(self, path: Path) -> None:
         """Publish a map file on /map, latched."""
@@ -188,7 +189,10 @@ class PlayedTopics:
             if time.monotonic() > deadline:
                 self._given_up.add(topic)
                 self._node.get_logger().warning(
-                    f"a subscriber of {topic} doesn't acknowledge; it is not waited for any more"
+                    plain(
+                        f"a subscriber of {topic} doesn't acknowledge; it is not waited for any "
+                        "more"
+                    )
                 )
 
 

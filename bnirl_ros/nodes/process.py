@@ -13,6 +13,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.signals import SignalHandlerOptions
 
 from bnirl_ros.errors import InputError
+from bnirl_ros.terminal_text import plain
 
 
 def run(name: str, body: Callable[[], None], arguments: Sequence[str] | None = None) -> int:
@@ -38,7 +39,7 @@ def run(name: str, body: Callable[[], None], arguments: Sequence[str] | None = N
     except KeyboardInterrupt:
         return 0
     except InputError as error:
-        print(f"{name}: {error}", file=sys.stderr)
+        print(plain(f"{name}: {error}"), file=sys.stderr)
         return 1
     except rclpy_implementation.RCLError as error:
         if os.environ.get("ROS_SECURITY_ENABLE") != "true":

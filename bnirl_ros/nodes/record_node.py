@@ -24,6 +24,7 @@ from bnirl_ros.nodes.conversion import is_installed, message_class
 from bnirl_ros.nodes.process import run, separated
 from bnirl_ros.nodes.qos import accepting, recorded_profile
 from bnirl_ros.nodes.selection import Selection, add_selection, selection_of
+from bnirl_ros.terminal_text import plain
 
 _LOOK_PERIOD = 0.2  # [s] between two looks at who publishes what, and at whether to stop
 _OF_ROS = ("/rosout", "/parameter_events")  # are published by every node
@@ -91,13 +92,13 @@ class RecordNode(Node):
             self.destroy_subscription(subscription)
         elif (fault := _fault(types)) is not None:
             self.skipped[topic] = fault
-            self.get_logger().warning(f"{topic} is not recorded: {fault}")
+            self.get_logger().warning(plain(f"{topic} is not recorded: {fault}"))
             return
         else:
             profiles = dict.fromkeys(map(recorded_profile, offered))
             self._bag.add_topic(topic, types[0], *profiles)
             self.recorded[topic] = 0
-            self.get_logger().info(f"records {topic}")
+            self.get_logger().info(plain(f"records {topic}"))
         subscription = self.create_subscription(
             message_class(types[0]), topic, self._recorder(topic), qos, raw=True
         )
@@ -149,7 +150,7 @@ def record(options: Options) -> None:
         finally:
             executor.shutdown()
             node.destroy_node()
-            print(node.report(), flush=True)
+            print(plain(node.report()), flush=True)
 
 
 def contract() -> tuple[str, ...]:

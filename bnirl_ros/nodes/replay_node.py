@@ -25,6 +25,7 @@ from bnirl_ros.nodes.played_topics import PlayedTopics
 from bnirl_ros.nodes.process import run, separated
 from bnirl_ros.nodes.replay_options import BETWEEN_BAGS, Options, parse
 from bnirl_ros.nodes.topics import NodeService
+from bnirl_ros.terminal_text import plain
 
 _TRIGGER = "std_srvs/srv/Trigger"
 SERVICES = (
@@ -138,13 +139,18 @@ class ReplayNode(Node):
         while (missing := self._topics.with_fewer_subscribers(count)) and not self._may_begin():
             if time.monotonic() > deadline:
                 self.get_logger().warning(
-                    f"no {wanted} of {', '.join(missing)} after {patience:g} s; goes on without"
+                    plain(
+                        f"no {wanted} of {', '.join(missing)} after {patience:g} s; goes on "
+                        "without"
+                    )
                 )
                 return
             if time.monotonic() > tell_at:
                 self.get_logger().info(
-                    f"waits for {'a ' * (count == 1)}{wanted} of {', '.join(missing)}, for "
-                    f"{patience:g} s at most; --topics leaves topics out, and ~/resume begins"
+                    plain(
+                        f"waits for {'a ' * (count == 1)}{wanted} of {', '.join(missing)}, for "
+                        f"{patience:g} s at most; --topics leaves topics out, and ~/resume begins"
+                    )
                 )
                 tell_at = math.inf
             self._serve(_LOOK_PERIOD)
@@ -343,13 +349,13 @@ def replay(options: Options) -> None:
     node = ReplayNode(bags, options)
     try:
         for warning in bags.warnings:
-            node.get_logger().warning(warning)
+            node.get_logger().warning(plain(warning))
         if not options.paused:
             node.wait_for_subscribers()
         node.play()
     finally:
         node.close()
-        print(node.report(), flush=True)
+        print(plain(node.report()), flush=True)
     if bags.damage:
         raise InputError(bags.damage)
 

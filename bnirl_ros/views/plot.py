@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from bnirl_ros.inference.summary import Summary
 from bnirl_ros.maps import GridMap
+from bnirl_ros.terminal_text import plain
 from bnirl_ros.views.colours import INK, UNEXPLAINED, Colour, colour_of, writing_on
 from bnirl_ros.views.map_panel import (
     ARROWS_FROM,
@@ -128,7 +129,8 @@ def draw_summary(
         figure.text(
             _LEFT / width,
             1.0 - 0.6 * layout.top / height,
-            title,
+            plain(title),
+            parse_math=False,
             fontsize=12,
             fontweight="bold",
             color=INK,
@@ -393,7 +395,8 @@ def _draw_legend(
         legend.text(
             x,
             y,
-            text,
+            plain(text),
+            parse_math=False,  # names of features may have any signs
             fontsize=8.5,
             color=SIGN if faint else INK,
             horizontalalignment="right" if right else "left",

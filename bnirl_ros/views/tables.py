@@ -8,6 +8,7 @@ from bnirl_ros.bags.topics import Topic
 from bnirl_ros.inference.chains import TIME_BUDGET, Sampling
 from bnirl_ros.inference.convergence import Convergence
 from bnirl_ros.inference.summary import Parameter, Subgoal, Summary
+from bnirl_ros.terminal_text import plain
 from bnirl_ros.views.pursuits import knows_pursuits, unexplained_share
 
 
@@ -89,7 +90,11 @@ def interval_of(parameter: Parameter) -> str:
 
 
 def aligned(table: Sequence[Sequence[str]]) -> str:
-    """The rows as lines, each column flush right and as wide as it has to be."""
+    """The rows as lines, each column flush right and as wide as it has to be.
+
+    A text stays on its line, whatever characters it has.
+    """
+    table = [[plain(text) for text in row] for row in table]
     widths = [max(len(text) for text in column) for column in zip(*table, strict=True)]
     return "\n".join(
         "  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True))
