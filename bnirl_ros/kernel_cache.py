@@ -16,7 +16,6 @@ import os
 import stat
 import sys
 import warnings
-from contextlib import suppress
 from pathlib import Path
 
 _VARIABLE = "NUMBA_CACHE_DIR"
@@ -65,12 +64,15 @@ def forget_stale_kernels(package: Path, place: Path) -> None:
     """
     sources = sorted(package.rglob("*.py"))
     found = [(str(source), source.stat().st_mtime_ns, source.stat().st_size) for source in sources]
-    stamp = hashlib.sha1(repr(found).encode()).hexdigest()
+    stamp = hashlib.sha1(repr(found).encode(), usedforsecurity=False).hexdigest()
     folders = sorted({source.parent for source in sources})
     if place.is_relative_to(package):
         kept = [folder / "__pycache__" for folder in folders]
     else:
-        digests = [hashlib.sha1(str(folder).encode()).hexdigest() for folder in folders]
+        digests = [
+            hashlib.sha1(str(folder).encode(), usedforsecurity=False).hexdigest()
+            for folder in folders
+        ]
         kept = [
             place / f"{folder.name}_{digest}"
             for folder, digest in zip(folders, digests, strict=True)
@@ -89,7 +91,7 @@ def temporary_folder(parent: Path) -> Path:
     """A folder that nobody else writes to: whoever does could have us run anything."""
     folder = parent / f"bnirl_ros-{os.getuid()}"
     # Its name is foretold, so that kernels are found again: somebody may have been there before.
-    with suppress(FileExistsError):
+    with contextlib.suppress(FileExistsError):
         folder.mkdir(mode=0o700)
     found = folder.lstat()
     others = stat.S_IWGRP | stat.S_IWOTH
