@@ -108,7 +108,7 @@ def _one_step_back(model, parameters, weights, belief):  # type: ignore[no-untyp
                 switched = 1.0
                 belief[t, candidate] = 0.0
             else:
-                rho = switch_probability(model, parameters, t, candidate)
+                rho = switch_probability(model.arrived, model.state_of, parameters, t, candidate)
                 before = belief[t - 1, candidate]
                 switched += rho * before
                 belief[t, candidate] = (1.0 - rho) * before

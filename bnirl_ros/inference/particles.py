@@ -260,7 +260,7 @@ def _extend_pursuits(model, prior_before, parameters, old, new, generator):  # t
             weights = urn_weights(model, eta, counts[draw], model.state_part[state])
             rho = 1.0
             if not model.starts[t]:
-                rho = switch_probability(model, values, t, last[draw])
+                rho = switch_probability(model.arrived, model.state_of, values, t, last[draw])
             kept = (1.0 - rho) * likely[last[draw]]
             drawn_anew = rho * weights * likely
             anew = drawn_anew.sum()

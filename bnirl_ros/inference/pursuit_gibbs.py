@@ -356,17 +356,21 @@ def unexplained(model, parameters, t):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, inline="always")
-def _place(model, t, candidate):  # type: ignore[no-untyped-def]
+def _place(arrived, state_of, t, candidate):  # type: ignore[no-untyped-def]
     """0 on arrival at the candidate, 1 where there already, 2 elsewhere."""
-    if not model.arrived[model.state_of[t], candidate]:
+    if not arrived[state_of[t], candidate]:
         return 2
-    return 1 if model.arrived[model.state_of[t - 1], candidate] else 0
+    return 1 if arrived[state_of[t - 1], candidate] else 0
 
 
 @njit(nogil=True, cache=True, inline="always")
-def switch_probability(model, parameters, t, candidate):  # type: ignore[no-untyped-def]
-    """Rho before observation t, which begins no episode, where `candidate` was pursued."""
-    return parameters[ON_ARRIVAL + _place(model, t, candidate)]
+def switch_probability(arrived, state_of, parameters, t, candidate):  # type: ignore[no-untyped-def]
+    """Rho before observation t, which begins no episode, where `candidate` was pursued.
+
+    Takes the two arrays of the model: for a model, numba would count references to all of its
+    arrays, which takes much longer than this.
+    """
+    return parameters[ON_ARRIVAL + _place(arrived, state_of, t, candidate)]
 
 
 @njit(nogil=True, cache=True)
@@ -409,29 +413,28 @@ def forward_pass(model, parameters, chosen, weights, first, end, before, forward
     scale = 1.0
     for t in range(first, end):
         state = state_of[t]
-        likely = chosen[pair_of[t]]
+        likely, after = chosen[pair_of[t]], forward[t - first]
         unexplained = parameters[SLIP] * uniform[state]
         keep, switch = 0.0, 1.0
-        here = near[:0]
+        here = there = near_first[state]
         if not starts[t]:
             keep, switch = (1.0 - elsewhere) * scale, elsewhere
-            here = near[near_first[state] : near_first[state + 1]]
+            there = near_first[state + 1]
             # Candidates at which the demonstrator has arrived are kept by a probability of their
             # own: they are taken out of the many, and added when these are done.
-            for index in range(here.shape[0]):
-                candidate = here[index]
+            for index in range(here, there):
+                candidate = near[index]
                 rho = at_subgoal if arrived[state_of[t - 1], candidate] else on_arrival
-                of_near[index] = before[candidate]
+                of_near[index - here] = before[candidate]
                 switch += before[candidate] * scale * (rho - elsewhere)
                 before[candidate] = 0.0
-        after = forward[t - first]
         for candidate in range(candidates):
             moved = before[candidate] * keep + switch * weights[candidate]
             after[candidate] = moved * (explained * likely[candidate] + unexplained)
-        for index in range(here.shape[0]):
-            candidate = here[index]
+        for index in range(here, there):
+            candidate = near[index]
             rho = at_subgoal if arrived[state_of[t - 1], candidate] else on_arrival
-            before[candidate] = of_near[index]
+            before[candidate] = of_near[index - here]
             kept = before[candidate] * scale * (1.0 - rho)
             after[candidate] += kept * (explained * likely[candidate] + unexplained)
         total = row_sum(after)
@@ -445,19 +448,6 @@ def near(model, t):  # type: ignore[no-untyped-def]
     """Candidates at which the demonstrator counts as having arrived when it chose action t."""
     state = model.state_of[t]
     return model.near[model.near_first[state] : model.near_first[state + 1]]
-
-
-@njit(nogil=True, cache=True, inline="always")
-def switch_mass(model, parameters, filtered, total, t):  # type: ignore[no-untyped-def]
-    """Probability of a switch before t, where theta_(t-1) is distributed as `filtered`.
-
-    Times `total`, to which `filtered` sums up.
-    """
-    mass = parameters[ELSEWHERE] * total
-    for candidate in near(model, t):
-        rho = switch_probability(model, parameters, t, candidate)
-        mass += filtered[candidate] * (rho - parameters[ELSEWHERE])
-    return mass
 
 
 @njit(nogil=True, cache=True)
@@ -506,6 +496,13 @@ def _draw_path(model, parameters, chosen, weights, theta, forward, first, end, g
     By forward filtering, backward sampling: given the `weights`, the parameters, and the subgoals
     before `first` and, where the episode goes on, at `end`; the switch at `end` is drawn, too.
     """
+    arrived, state_of, near_first, near = (
+        model.arrived,
+        model.state_of,
+        model.near_first,
+        model.near,
+    )
+    elsewhere = parameters[ELSEWHERE]
     candidates = weights.shape[0]
     goes_on = end < model.starts.shape[0] and not model.starts[end]
     last = end + 1 if goes_on else end
@@ -526,26 +523,29 @@ def _draw_path(model, parameters, chosen, weights, theta, forward, first, end, g
     for t in range(last - 1, first, -1):
         i = t - first
         target = new_theta[i]
-        filtered = forward[i - 1]
-        rho = switch_probability(model, parameters, t, target)
-        kept = filtered[target] * (1.0 - rho)
-        mass = switch_mass(model, parameters, filtered, evidence[i - 1], t)
+        rho = switch_probability(arrived, state_of, parameters, t, target)
+        kept = forward[i - 1, target] * (1.0 - rho)
+        mass = elsewhere * evidence[i - 1]  # of a switch
+        here, there = near_first[state_of[t]], near_first[state_of[t] + 1]
+        for index in range(here, there):
+            candidate = near[index]
+            rho = switch_probability(arrived, state_of, parameters, t, candidate)
+            mass += forward[i - 1, candidate] * (rho - elsewhere)
         switches = mass * weights[target]
         new_switched[i] = generator.random() * (kept + switches) >= kept
         if new_switched[i]:
-            elsewhere = parameters[ELSEWHERE]
             for candidate in range(candidates):
-                weight[candidate] = filtered[candidate] * elsewhere
-            for candidate in near(model, t):
-                weight[candidate] = filtered[candidate] * switch_probability(
-                    model, parameters, t, candidate
-                )
+                weight[candidate] = forward[i - 1, candidate] * elsewhere
+            for index in range(here, there):
+                candidate = near[index]
+                rho = switch_probability(arrived, state_of, parameters, t, candidate)
+                weight[candidate] = forward[i - 1, candidate] * rho
             new_theta[i - 1] = categorical(weight, row_sum(weight), generator)
         else:
             new_theta[i - 1] = target
     new_switched[0] = True
     if not model.starts[first] and new_theta[0] == theta[first - 1]:
-        rho = switch_probability(model, parameters, first, new_theta[0])
+        rho = switch_probability(arrived, state_of, parameters, first, new_theta[0])
         switches = rho * weights[new_theta[0]]
         new_switched[0] = generator.random() * (1.0 - rho + switches) >= 1.0 - rho
     return new_theta, new_switched
@@ -787,16 +787,16 @@ def group_scores(model, state, chosen, groups):  # type: ignore[no-untyped-def]
     explained = 1.0 - parameters[SLIP]
     least = max(explained * LEAST_PROBABILITY, parameters[SLIP] * model.uniform.min())
     most_factors = max(1, int(math.log(1e-300) / math.log(least)))  # that cannot underflow
+    partition_of, state_of, pair_of = state.partition_of, model.state_of, model.pair_of
     for t in model.by_pair:  # a row of the table is read once
-        group = state.partition_of[t]
-        part[group] = model.state_part[model.state_of[t]]
-        by_slip = parameters[SLIP] * model.uniform[model.state_of[t]]
-        product, likely = products[group], chosen[model.pair_of[t]]
+        group, pair = partition_of[t], pair_of[t]
+        part[group] = model.state_part[state_of[t]]
+        by_slip = parameters[SLIP] * model.uniform[state_of[t]]
         for candidate in range(candidates):
-            product[candidate] *= explained * likely[candidate] + by_slip
+            products[group, candidate] *= explained * chosen[pair, candidate] + by_slip
         factors[group] += 1
         if factors[group] % most_factors == 0:
-            _take_out_powers(product, powers[group])
+            _take_out_powers(products[group], powers[group])
     scores = np.empty((groups, candidates))
     for group in range(groups):
         for candidate in range(candidates):
@@ -805,18 +805,19 @@ def group_scores(model, state, chosen, groups):  # type: ignore[no-untyped-def]
                 scores[group, candidate] = score + powers[group, candidate] * _LN_2
             else:
                 scores[group, candidate] = -np.inf
-    for t in range(state.subgoal_of.shape[0]):
-        if model.starts[t]:
-            continue
-        group = state.partition_of[t - 1]
-        # What a candidate at which the demonstrator had arrived gains over the others.
-        usual = parameters[ELSEWHERE]
-        for candidate in near(model, t):
-            rho = switch_probability(model, parameters, t, candidate)
-            if state.switched[t]:
-                scores[group, candidate] += floored_log(rho) - floored_log(usual)
-            else:
-                scores[group, candidate] += floored_log(1.0 - rho) - floored_log(1.0 - usual)
+    # What a candidate at which the demonstrator had arrived gains over the others.
+    gains = np.empty((2, 2))  # by whether there was a switch, and `_place`
+    for place in range(2):
+        rho, usual = parameters[ON_ARRIVAL + place], parameters[ELSEWHERE]
+        gains[0, place] = floored_log(1.0 - rho) - floored_log(1.0 - usual)
+        gains[1, place] = floored_log(rho) - floored_log(usual)
+    arrived, near, switched = model.arrived, model.near, state.switched
+    for t in range(1, partition_of.shape[0]):
+        if not model.starts[t]:
+            state_now = state_of[t]
+            for index in range(model.near_first[state_now], model.near_first[state_now + 1]):
+                place = _place(arrived, state_of, t, near[index])
+                scores[partition_of[t - 1], near[index]] += gains[np.int64(switched[t]), place]
     return scores
 
 
@@ -854,11 +855,18 @@ def _draw_switches(model, state, generator):  # type: ignore[no-untyped-def]
     candidates = weights.shape[0]
     same = np.zeros((3, candidates))
     changes = np.zeros(3, dtype=np.int64)
-    for t in range(1, state.subgoal_of.shape[0]):
-        if not model.starts[t]:
-            candidate = state.subgoal_of[t - 1]
-            place = _place(model, t, candidate)
-            if state.subgoal_of[t] == candidate:
+    theta, parameters, switched, counts = (
+        state.subgoal_of,
+        state.parameters,
+        state.switched,
+        state.counts,
+    )
+    starts, arrived, state_of = model.starts, model.arrived, model.state_of
+    for t in range(1, theta.shape[0]):
+        if not starts[t]:
+            candidate = theta[t - 1]
+            place = _place(arrived, state_of, t, candidate)
+            if theta[t] == candidate:
                 same[place, candidate] += 1.0
             else:
                 changes[place] += 1
@@ -876,17 +884,17 @@ def _draw_switches(model, state, generator):  # type: ignore[no-untyped-def]
                 same[place],
                 weights,
             )
-            _draw_by_slice(model, state.parameters, parameter, evidence, generator)
-    state.counts[:] = 0
-    for t in range(state.subgoal_of.shape[0]):
-        candidate = state.subgoal_of[t]
-        if model.starts[t] or candidate != state.subgoal_of[t - 1]:
-            state.switched[t] = True
+            _draw_by_slice(model, parameters, parameter, evidence, generator)
+    counts[:] = 0
+    for t in range(theta.shape[0]):
+        candidate = theta[t]
+        if starts[t] or candidate != theta[t - 1]:
+            switched[t] = True
         else:
-            rho = switch_probability(model, state.parameters, t, candidate)
+            rho = switch_probability(arrived, state_of, parameters, t, candidate)
             again = rho * weights[candidate]
-            state.switched[t] = generator.random() * (1.0 - rho + again) < again
-        state.counts[candidate] += state.switched[t]
+            switched[t] = generator.random() * (1.0 - rho + again) < again
+        counts[candidate] += switched[t]
 
 
 @njit(nogil=True, cache=True)
@@ -1086,11 +1094,12 @@ def _log_of_costs(alpha, slip, evidence):  # type: ignore[no-untyped-def]
 @njit(nogil=True, cache=True)
 def log_joint_of(model, state, chosen):  # type: ignore[no-untyped-def]
     """As `PursuitModel.log_joint`."""
-    parameters, total = state.parameters, 0.0
-    for t in range(state.subgoal_of.shape[0]):
-        total += floored_log(likelihood(model, parameters, chosen, t, state.subgoal_of[t]))
+    parameters, theta, total = state.parameters, state.subgoal_of, 0.0
+    arrived, state_of = model.arrived, model.state_of
+    for t in range(theta.shape[0]):
+        total += floored_log(likelihood(model, parameters, chosen, t, theta[t]))
         if not model.starts[t]:
-            rho = switch_probability(model, parameters, t, state.subgoal_of[t - 1])
+            rho = switch_probability(arrived, state_of, parameters, t, theta[t - 1])
             total += floored_log(rho if state.switched[t] else 1.0 - rho)
     return total + log_urns(model, parameters[ETA], state.counts)
 

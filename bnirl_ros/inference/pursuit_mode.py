@@ -237,7 +237,9 @@ def _joint_and_slips(model, state):  # type: ignore[no-untyped-def]
     for t in range(state.subgoal_of.shape[0]):
         total += likely[model.pair_of[t], state.subgoal_of[t]]
         if not model.starts[t]:
-            rho = switch_probability(model, state.parameters, t, state.subgoal_of[t - 1])
+            rho = switch_probability(
+                model.arrived, model.state_of, state.parameters, t, state.subgoal_of[t - 1]
+            )
             if rho != rho_before:
                 rho_before, kept, left = rho, floored_log(1.0 - rho), floored_log(rho)
             total += left if state.switched[t] else kept
@@ -391,7 +393,7 @@ def _viterbi(model, parameters, likely, weights, theta, first, end, last):  # ty
             leaving[:] = best + _infinite_log(elsewhere)
             keeping = best + _infinite_log(1.0 - elsewhere)
             for candidate in near(model, t):
-                rho = switch_probability(model, parameters, t, candidate)
+                rho = switch_probability(model.arrived, model.state_of, parameters, t, candidate)
                 leaving[candidate] = best[candidate] + _infinite_log(rho)
                 keeping[candidate] = best[candidate] + _infinite_log(1.0 - rho)
             came_from[i] = leaving.argmax()
@@ -421,7 +423,7 @@ def _path_score(model, parameters, likely, weights, path, switched, theta, first
         t = first + i
         if not model.starts[t]:
             before = path[i - 1] if i > 0 else theta[first - 1]
-            rho = switch_probability(model, parameters, t, before)
+            rho = switch_probability(model.arrived, model.state_of, parameters, t, before)
             score += floored_log(rho if switched[i] else 1.0 - rho)
         if switched[i]:
             score += math.log(weights[path[i]])
