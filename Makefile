@@ -80,7 +80,8 @@ benchmark: venv  ## Time the main job, its parts and the node, and see how cost 
 		$(BIN)/python benchmarks/$$name.py || failed=1; \
 	done; exit $$failed
 
-campaigns: venv  ## Damage bags in thousands of ways, and see what is read of them
+campaigns: venv  ## Damage bags and journals in thousands of ways, and see what is read of them
+	$(BIN)/python -m bnirl_ros.experiments.journal_cuts
 	$(BIN)/python -m bnirl_ros.experiments.damage $(CAMPAIGN_ARGS) bags $(wildcard $(BAGS))
 
 study: venv  ## Measure what the models find, into bnirl_out/study.md

@@ -226,6 +226,7 @@ def main() -> int:
     print(machine(("numpy", "numba", "ros-rclpy")))
     start = multiprocessing.get_context("spawn").Process
     with tempfile.TemporaryDirectory() as folder:
+        os.environ["ROS_HOME"] = folder
         path = Path(folder, "times.npz")
         node = start(target=take, args=(path,), daemon=True)
         node.start()

@@ -72,18 +72,20 @@ def write(bag: Path, count: int, rate: float) -> np.ndarray:
 def process(name: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
     """One of our nodes, stopped at the end."""
     code = f"import sys; from bnirl_ros.nodes.start import {name}; sys.exit({name}())"
-    running = subprocess.Popen(
-        [sys.executable, "-c", code, *arguments],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        yield running
-    finally:
-        if running.poll() is None:
-            running.send_signal(signal.SIGINT)
-            running.wait(60)
+    with tempfile.TemporaryDirectory() as home:
+        running = subprocess.Popen(
+            [sys.executable, "-c", code, *arguments],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            env=os.environ | {"ROS_HOME": home},
+            text=True,
+        )
+        try:
+            yield running
+        finally:
+            if running.poll() is None:
+                running.send_signal(signal.SIGINT)
+                running.wait(60)
 
 
 def spin_until(executor: Any, happened: Callable[[], Any]) -> None:

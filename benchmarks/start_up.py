@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import importlib.util
+import os
 import signal
 import subprocess
 import sys
@@ -107,7 +108,12 @@ class Demonstrator:
         self._found = False
         begin = time.perf_counter()
         program = "from bnirl_ros.nodes.start import subgoal_node; subgoal_node()"
-        with subprocess.Popen([sys.executable, "-c", program]) as process:
+        with (
+            tempfile.TemporaryDirectory() as home,
+            subprocess.Popen(
+                [sys.executable, "-c", program], env=os.environ | {"ROS_HOME": home}
+            ) as process,
+        ):
             self._until(lambda: all(p.get_subscription_count() for p in self._publishers.values()))
             heard = time.perf_counter()
             self._publishers["map"].publish(self._map)

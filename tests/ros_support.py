@@ -71,13 +71,21 @@ class NodeProcess:
                 [sys.executable, "-c", code, *map(str, arguments)],
                 stdout=out,
                 stderr=err,
-                env=os.environ | {"PYTHONPATH": str(Path(bnirl_ros.__file__).parents[1])},
+                env={
+                    "ROS_HOME": str(folder / "ros_home"),  # what one kept is no other's to find
+                    **os.environ,
+                    "PYTHONPATH": str(Path(bnirl_ros.__file__).parents[1]),
+                },
             )
 
     @property
     def err(self) -> str:
         """What it has said on standard error so far."""
         return self._err.read_text()
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
 
     @property
     def running(self) -> bool:

@@ -24,7 +24,7 @@ ORDER = [
     {"baselines"},
     {"bags"},
     {"views"},
-    {"fleet"},
+    {"fleet", "journal"},
     {"experiments"},
     {"nodes"},
     {"cli"},

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -41,6 +43,21 @@ class _Channel:
     messages: int = 0
 
 
+@dataclass(frozen=True)
+class BagPart:
+    """One of the files of a bag, as its metadata tell.
+
+    Attributes:
+        name: of the file.
+        messages: how many, by topic.
+        span: the first and the last log time [ns]; None without messages.
+    """
+
+    name: str
+    messages: Mapping[str, int]
+    span: tuple[int, int] | None
+
+
 class BagWriter:
     """Writes one rosbag2 folder, `<name>/<name>_0.mcap` and `<name>/metadata.yaml`.
 
@@ -60,6 +77,7 @@ class BagWriter:
         self._folder = Path(folder)
         self._file_name = f"{self._folder.resolve().name}_0.mcap"
         self._partial = self._folder / f"{self._file_name}.partial"
+        self._earlier: tuple[BagPart, ...] = ()  # files of the bag that are there already
         self._overwrite = overwrite
         self._channels: dict[str | tuple[str, ...], _Channel] = {}
         self._schema_ids: dict[tuple[str, str, bytes], int] = {}
@@ -73,7 +91,8 @@ class BagWriter:
         from mcap.writer import Writer  # only those who write pay for it
 
         try:
-            if not self._overwrite and self._folder.exists() and any(self._folder.iterdir()):
+            is_new = not (self._overwrite or self._earlier)
+            if is_new and self._folder.exists() and any(self._folder.iterdir()):
                 raise InputError(
                     f"{self._folder}: exists already; choose another name, or allow it to be "
                     "overwritten"
@@ -237,20 +256,34 @@ class BagWriter:
         yaml_file = self._folder / "metadata.yaml"
         yaml_file.unlink(missing_ok=True)
         self._partial.replace(self._folder / self._file_name)
-        stem = re.escape(self._file_name.removesuffix("_0.mcap"))
+        own = {self._file_name, *(part.name for part in self._earlier)}
+        stem = re.escape(self._folder.resolve().name)
         for split in self._folder.glob("*.mcap"):
-            if re.fullmatch(rf"{stem}_[1-9]\d*\.mcap", split.name):
+            if split.name not in own and re.fullmatch(rf"{stem}_\d+\.mcap", split.name):
                 split.unlink()
         indented = "".join(f"  {line}\n" for line in metadata.splitlines())
         yaml_file.write_text(f"rosbag2_bagfile_information:\n{indented}", encoding="utf-8")
 
     def _metadata(self) -> str:
         """Version 9 of rosbag2's metadata, in the order in which rosbag2 writes it."""
-        start = _NEVER if self._start is None else self._start
-        duration = 0 if self._start is None else self._end - self._start
-        messages = sum(channel.messages for channel in self._channels.values())
-        file_name = _quoted(self._file_name)
-        topics = "\n".join(_topic_metadata(channel) for channel in self._channels.values())
+        span = None if self._start is None else (self._start, self._end)
+        counts: Counter[str] = Counter()  # channels of several types may have one name
+        for channel in self._channels.values():
+            counts[channel.name] += channel.messages
+        parts = (*self._earlier, BagPart(self._file_name, counts, span))
+        spans = [part.span for part in parts if part.span is not None]
+        whole = (min(spans)[0], max(end for _, end in spans)) if spans else None
+        start, duration = _start_and_duration(whole)
+        files = "\n".join(_file_metadata(part) for part in parts)
+        paths = "\n".join(f"  - {_quoted(part.name)}" for part in parts)
+        topics = "\n".join(
+            _topic_metadata(
+                channel,
+                channel.messages
+                + sum(part.messages.get(channel.name, 0) for part in self._earlier),
+            )
+            for channel in self._channels.values()
+        )
         return f"""\
 version: 9
 storage_identifier: mcap
@@ -258,25 +291,36 @@ duration:
   nanoseconds: {duration}
 starting_time:
   nanoseconds_since_epoch: {start}
-message_count: {messages}
+message_count: {sum(sum(part.messages.values()) for part in parts)}
 topics_with_message_count:
 {topics or "  []"}
 compression_format: ""
 compression_mode: ""
 relative_file_paths:
-  - {file_name}
+{paths}
 files:
-  - path: {file_name}
-    starting_time:
-      nanoseconds_since_epoch: {start}
-    duration:
-      nanoseconds: {duration}
-    message_count: {messages}
+{files}
 custom_data: ~
 ros_distro: jazzy"""
 
 
-def _topic_metadata(channel: _Channel) -> str:
+def _start_and_duration(span: tuple[int, int] | None) -> tuple[int, int]:
+    """As rosbag2 writes a span of log times [ns], or that there is none."""
+    return (_NEVER, 0) if span is None else (span[0], span[1] - span[0])
+
+
+def _file_metadata(part: BagPart) -> str:
+    start, duration = _start_and_duration(part.span)
+    return f"""\
+  - path: {_quoted(part.name)}
+    starting_time:
+      nanoseconds_since_epoch: {start}
+    duration:
+      nanoseconds: {duration}
+    message_count: {sum(part.messages.values())}"""
+
+
+def _topic_metadata(channel: _Channel, messages: int) -> str:
     profiles = channel.qos_yaml if channel.qos_yaml.lstrip().startswith("-") else "[]"
     qos = "\n".join(f"        {line}" for line in profiles.splitlines())
     return f"""\
@@ -287,7 +331,7 @@ def _topic_metadata(channel: _Channel) -> str:
       offered_qos_profiles:
 {qos}
       type_description_hash: {_quoted(channel.type_hash)}
-    message_count: {channel.messages}"""
+    message_count: {messages}"""
 
 
 def _quoted(text: str) -> str:

@@ -61,6 +61,7 @@ class Recorder:
             self._pose_frames = array("q")
             self._action_stamps = array("q")
             self._actions = array("q")
+            self._drained = 0, 0  # poses and actions
 
     def map_arrived(self) -> None:
         """There is a map now: nothing has to wait for one any more."""
@@ -103,6 +104,17 @@ class Recorder:
             self._actions.append(action)
         return None
 
+    def restore(self, recording: Recording) -> None:
+        """Take in at once what was recorded before, waiting for a map or not; it is drained."""
+        numbers = [self._frames.setdefault(name, len(self._frames)) for name in recording.frames]
+        with self._lock:
+            self._pose_stamps.extend(recording.pose_stamps.tolist())
+            self._positions.extend(recording.positions.ravel().tolist())
+            self._pose_frames.extend(numbers[frame] for frame in recording.pose_frames.tolist())
+            self._action_stamps.extend(recording.action_stamps.tolist())
+            self._actions.extend(recording.actions.tolist())
+            self._drained = len(self._pose_stamps), len(self._actions)
+
     def __len__(self) -> int:
         """Number of messages taken in."""
         return len(self._pose_stamps) + len(self._action_stamps)
@@ -110,14 +122,25 @@ class Recorder:
     def snapshot(self) -> Recording:
         """All that was taken in so far, as arrays of its own."""
         with self._lock:
-            return Recording(
-                pose_stamps=np.array(self._pose_stamps, dtype=np.int64),
-                positions=np.array(self._positions, dtype=np.float64).reshape(-1, 2),
-                pose_frames=np.array(self._pose_frames, dtype=np.int64),
-                frames=tuple(self._frames),
-                action_stamps=np.array(self._action_stamps, dtype=np.int64),
-                actions=np.array(self._actions, dtype=np.int64),
-            )
+            return self._since(0, 0)
+
+    def drain(self) -> Recording:
+        """What was taken in since the last call, for one who keeps it elsewhere."""
+        with self._lock:
+            new = self._since(*self._drained)
+            self._drained = len(self._pose_stamps), len(self._actions)
+        return new
+
+    def _since(self, pose: int, action: int) -> Recording:
+        """What was taken in from a pose and an action on, by their numbers."""
+        return Recording(
+            pose_stamps=np.array(self._pose_stamps[pose:], dtype=np.int64),
+            positions=np.array(self._positions[2 * pose :], dtype=np.float64).reshape(-1, 2),
+            pose_frames=np.array(self._pose_frames[pose:], dtype=np.int64),
+            frames=tuple(self._frames),
+            action_stamps=np.array(self._action_stamps[action:], dtype=np.int64),
+            actions=np.array(self._actions[action:], dtype=np.int64),
+        )
 
     def _refuse(self, fault: str) -> str:
         self.faults[fault] += 1

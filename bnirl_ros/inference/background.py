@@ -12,6 +12,7 @@ from bnirl_ros.demonstrations.placement import Placement, place
 from bnirl_ros.demonstrations.recording import Recorder
 from bnirl_ros.errors import InputError
 from bnirl_ros.inference.chains import StoppedError
+from bnirl_ros.inference.checkpoint import Checkpoint
 from bnirl_ros.inference.intent import IntentFilter
 from bnirl_ros.inference.posterior import Posterior, infer
 from bnirl_ros.inference.running import RunningPosterior
@@ -24,6 +25,8 @@ from bnirl_ros.maps.grid_map import GridMap
 # that the time is spent on sweeps.
 _FIRST_ROUND = 0.1
 _ROUND = 1.0
+_CHECKPOINT_PERIOD = 10.0  # [s] at the least between two checkpoints
+_CHECKPOINT_SHARE = 50  # of the time that one takes, if that is longer
 _DRAWS = 4  # of each chain, between two looks at whether something has changed
 
 
@@ -53,9 +56,26 @@ class Result:
 class BackgroundInference(Worker):
     """Keeps a posterior up to date with a recorder."""
 
-    def __init__(self, recorder: Recorder, settings: Settings, episode_gap: float) -> None:
-        """Start the thread; it waits for a map and observations."""
+    def __init__(
+        self,
+        recorder: Recorder,
+        settings: Settings,
+        episode_gap: float,
+        checkpoint: Checkpoint | None = None,
+        keep: Callable[[bytes], None] | None = None,
+    ) -> None:
+        """Start the thread; it waits for a map and observations.
+
+        Args:
+            recorder: what to infer from.
+            settings: of the inference.
+            episode_gap: longest time between two poses of an episode [s].
+            checkpoint: from which the chains are to go on.
+            keep: called in the thread, now and then, with the bytes of a checkpoint.
+        """
         super().__init__("inference", recorder, episode_gap)
+        self._checkpoint, self._keep = checkpoint, keep
+        self._keep_at = 0.0  # [s]
         self._settings = settings
         self._grid_map: GridMap | None = None
         self._paused = False
@@ -96,7 +116,13 @@ class BackgroundInference(Worker):
 
     def reset(self) -> None:
         """Forget the chains and any result not yet taken; the recorder was cleared."""
-        self._update(_forget=True, _changed=True, _result=None, _resets=self._resets + 1)
+        self._update(
+            _forget=True,
+            _changed=True,
+            _result=None,
+            _resets=self._resets + 1,
+            _checkpoint=None,
+        )
 
     def infer(self, finish: Callable[[Result], None] | None = None) -> Future[Result]:
         """Ask for an inference with fresh chains over all observations so far.
@@ -213,7 +239,7 @@ class BackgroundInference(Worker):
             if len(placement.demonstration) == 0:
                 self._running = None
                 return Result(grid_map, placement, None, 0)
-            before = self._running
+            before = self._running or self._resumed(grid_map, settings)
             self._running = RunningPosterior(placement, grid_map, settings, before)
             # At once, but for chains that would never get to sweep if all goes on changing.
             if self._running.ready and before and before.sweeps:
@@ -226,7 +252,29 @@ class BackgroundInference(Worker):
             running.advance(_DRAWS)
             if self._changed or running.finished or time.monotonic() > end:
                 break
+        self._keep_if_due(running)
         return self._running_result()
+
+    def _resumed(self, grid_map: GridMap, settings: Settings) -> RunningPosterior | None:
+        """The chains of the checkpoint, if there is one; it is used once."""
+        checkpoint, self._checkpoint = self._checkpoint, None
+        try:
+            return RunningPosterior.resumed(checkpoint, grid_map, settings) if checkpoint else None
+        except InputError as error:
+            self.last_error = str(error)
+            return None
+
+    def _keep_if_due(self, running: RunningPosterior) -> None:
+        """Have a checkpoint kept: of chains that are done, and every few seconds of others."""
+        begin = time.monotonic()
+        if self._keep is None or (begin < self._keep_at and not running.finished):
+            return
+        try:
+            self._keep(running.checkpoint().to_bytes())
+        except InputError as error:
+            self.last_error = str(error)
+        end = time.monotonic()
+        self._keep_at = end + max(_CHECKPOINT_PERIOD, _CHECKPOINT_SHARE * (end - begin))
 
     def _running_result(self) -> Result:
         running = self._running

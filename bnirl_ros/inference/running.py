@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from dataclasses import replace
 from typing import Any
 
@@ -10,8 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from bnirl_ros.demonstrations.placement import Placement
+from bnirl_ros.errors import InputError
 from bnirl_ros.inference import mode, pursuit_mode
 from bnirl_ros.inference.chains import CONVERGED, SWEEP_LIMIT, TIME_BUDGET, Sampling
+from bnirl_ros.inference.checkpoint import Checkpoint, digest_of
 from bnirl_ros.inference.draws import Draws, most_draws
 from bnirl_ros.inference.known_goals import KnownGoals
 from bnirl_ros.inference.mode import Mode
@@ -94,6 +97,44 @@ class RunningPosterior:
                 self._sampler.initial_state(self._model, generator)
                 for generator in self._generators
             ]
+
+    @classmethod
+    def resumed(
+        cls, checkpoint: Checkpoint, grid_map: GridMap, settings: Settings
+    ) -> RunningPosterior:
+        """One whose chains go on from where they were when the checkpoint was made.
+
+        Raises:
+            InputError: it was made on another map, or with other settings.
+        """
+        if checkpoint.map_digest != digest_of(grid_map):
+            raise InputError("checkpoint: was made on another map; the chains start anew")
+        if checkpoint.settings != settings:
+            raise InputError("checkpoint: was made with other settings; the chains start anew")
+        placement = Placement(
+            demonstration=checkpoint.demonstration,
+            poses=checkpoint.poses,
+            last_poses=checkpoint.last_poses,
+            messages=0,
+            faults=Counter(),
+        )
+        running = cls(placement, grid_map, settings)
+        running._chains = list(checkpoint.states)
+        for generator, state in zip(running._generators, checkpoint.generators, strict=True):
+            generator.bit_generator.state = state
+        return running
+
+    def checkpoint(self) -> Checkpoint:
+        """Where the chains are; they go on from there in any process, draw for draw."""
+        return Checkpoint(
+            map_digest=digest_of(self.grid_map),
+            settings=self.settings,
+            demonstration=self.placement.demonstration,
+            poses=self.placement.poses,
+            last_poses=self.placement.last_poses,
+            states=tuple(self._states),
+            generators=tuple(dict(each.bit_generator.state) for each in self._generators),
+        )
 
     @property
     def finished(self) -> bool:

@@ -110,6 +110,7 @@ def demo(bag: Path, out: Path) -> None:
         stack.callback(watcher.destroy_node)
         tell = stack.enter_context(_teller())
         parameters = ["--ros-args", "-p", f"result_folder:={out.resolve()}"]
+        parameters += ["-p", "journal:=false"]  # it was demonstrated long ago, and is in a bag
         node = stack.enter_context(_process("subgoal_node", parameters))
         both = ["--subscribers", "2"]  # the node, and the watcher
         replay = stack.enter_context(_process("replay_node", [str(bag), "--fast", *both]))

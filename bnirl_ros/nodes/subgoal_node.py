@@ -11,9 +11,12 @@ from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.qos import QoSProfile
+from rclpy.serialization import serialize_message
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
+from bnirl_ros.bags.demonstration import RecordedDemonstration
+from bnirl_ros.confinement import ros_folder
 from bnirl_ros.demonstrations.messages import TOPIC_TYPES, map_of, take_action, take_pose
 from bnirl_ros.demonstrations.placement import EPISODE_GAP, place
 from bnirl_ros.demonstrations.recording import Recorder
@@ -22,6 +25,7 @@ from bnirl_ros.inference.background import BackgroundInference, Result
 from bnirl_ros.inference.settings import Settings
 from bnirl_ros.inference.summary import Summary, nothing_found
 from bnirl_ros.inference.watching import BackgroundWatch
+from bnirl_ros.journal.keeper import Keeper
 from bnirl_ros.limits import Limits
 from bnirl_ros.maps import FeatureLayer, GridMap, load_features, with_features
 from bnirl_ros.nodes.drawing import Drawing
@@ -30,6 +34,7 @@ from bnirl_ros.nodes.managed import LATCHED, ManagedNode, publish, serve
 from bnirl_ros.nodes.parameters import NodeParameter, declare_settings
 from bnirl_ros.nodes.subscriptions import take_together
 from bnirl_ros.nodes.topics import NodeService, NodeTopic
+from bnirl_ros.terminal_text import plain
 from bnirl_ros.views.belief import belief_grid
 from bnirl_ros.views.diagnostics import Health, inference_values
 from bnirl_ros.views.intent import current_subgoal, intent_markers, no_intent
@@ -73,6 +78,25 @@ PARAMETERS = (
         "",
         Limits("folder for the result files of ~/infer, as of bnirl infer; empty: none"),
         names_file=True,
+    ),
+    NodeParameter(
+        "journal",
+        True,
+        Limits("whether what is observed is kept on the disk, so that it outlives the process"),
+    ),
+    NodeParameter(
+        "journal_folder",
+        "",
+        Limits(
+            "folder of the journals; empty: journals in bnirl_ros in ROS_HOME, which is ~/.ros "
+            "unless it is set, below it the node's name with its namespace"
+        ),
+        names_file=True,
+    ),
+    NodeParameter(
+        "journal_interval",
+        1.0,
+        Limits("longest time that an observation waits to be kept [s]", above=0.0, highest=3600.0),
     ),
 )
 """The node's own parameters; those of the inference are in `bnirl_ros.inference.settings`."""
@@ -183,8 +207,9 @@ class SubgoalNode(ManagedNode):
         self._saved_waypoints: Waypoints | None = None
         if waypoints := self.file("waypoints_file"):
             self._saved_waypoints = read_waypoints(waypoints)
-        self._outputs = self.advertise(OUTPUTS)
         self._recorder = Recorder(values["waiting_limit"])
+        self._keeper = keeper = self._journal(values)
+        self._outputs = self.advertise(OUTPUTS)
         self._shown: dict[str, Message] = {}  # the last messages on what is pursued now
         self._result: Result | None = None
         self._drawing = Drawing()
@@ -192,8 +217,19 @@ class SubgoalNode(ManagedNode):
         self._assignments_at = -math.inf  # [s] by the machine's own time
         self._paused = False
         gap = values["episode_gap"]
-        self._inference = BackgroundInference(self._recorder, self._settings, gap)
+        self._inference = BackgroundInference(
+            self._recorder,
+            self._settings,
+            gap,
+            keeper.checkpoint if keeper else None,
+            keeper.keep_checkpoint if keeper else None,
+        )
         self._watch = BackgroundWatch(self._recorder, gap)
+        self._grid_map: GridMap | None = None
+        for warning in keeper.warnings if keeper else ():
+            self._warn(warning)
+        if keeper and keeper.recovered:
+            self._go_on_from(keeper.recovered)
 
     def activate(self) -> None:
         """Hear, infer, and publish what was found before."""
@@ -218,6 +254,9 @@ class SubgoalNode(ManagedNode):
         self._inference.close()
         self._watch.close()
         self._drawing.close()
+        if self._keeper:
+            self._keeper.close()
+            self._warn(self._keeper.error)
         self._answer()
 
     def health(self) -> Health:
@@ -248,7 +287,7 @@ class SubgoalNode(ManagedNode):
                 len(self._recorder) - (result.placement.messages if result else 0),
             ),
             faults=faults + result.placement.faults if result else faults,
-            error=self._inference.error or self._watch.error,
+            error=self._inference.error or self._watch.error or self._unkept,
             last_error=self._inference.last_error or self._watch.last_error,
         )
 
@@ -271,13 +310,61 @@ class SubgoalNode(ManagedNode):
     def _on_map(self, message: Any) -> None:
         try:
             grid_map = map_of(message, "topic map")
-            if self._features:
-                grid_map = with_features(grid_map, self._features)
+            is_new = self._grid_map is None or not grid_map.is_same_as(self._grid_map)
+            self._use_map(grid_map)
         except InputError as error:
             self.faults[str(error)] += 1
             return
+        if self._keeper and is_new:
+            self._keeper.map_arrived(serialize_message(message))
+
+    def _use_map(self, grid_map: GridMap) -> None:
+        featured = with_features(grid_map, self._features) if self._features else grid_map
+        self._grid_map = grid_map
         self._recorder.map_arrived()
-        self._inference.use_map(grid_map)
+        self._inference.use_map(featured)
+
+    def _journal(self, values: dict[str, Any]) -> Keeper | None:
+        """What keeps the observations, if anything is to; the recorder has what was kept."""
+        if not values["journal"]:
+            return None
+        folder = self.file("journal_folder")
+        name = self.get_fully_qualified_name().strip("/").replace("/", ".")
+        place = folder or ros_folder() / "journals" / name
+        try:
+            return Keeper(place, self._recorder, values["journal_interval"])
+        except InputError as error:
+            if folder:
+                raise
+            self._warn(f"{error}; until then, what is observed is lost with the process")
+            return None
+
+    def _go_on_from(self, recovered: RecordedDemonstration) -> None:
+        """Infer from what a process had kept that was cut off, and say so."""
+        assert self._keeper is not None
+        recording = recovered.recording
+        self.get_logger().info(
+            plain(
+                f"goes on with {len(recording.pose_stamps)} poses and {len(recording.actions)} "
+                f"actions that {self._keeper.journal} held, since the last run did not end in "
+                "order; ~/reset forgets them"
+            )
+        )
+        if recovered.grid_map:
+            try:
+                self._use_map(recovered.grid_map)
+            except InputError as error:
+                self._warn(f"the map of the last run is not used: {error}")
+        self._inference.observations_arrived()
+        self._watch.observations_arrived()
+
+    @property
+    def _unkept(self) -> str:
+        return self._keeper.error if self._keeper else ""
+
+    def _warn(self, sentence: str) -> None:
+        if sentence:
+            self.get_logger().warning(plain(sentence))
 
     async def _on_infer(self, _: Any, response: Any) -> Any:
         if self._is_refused(response):
@@ -324,6 +411,8 @@ class SubgoalNode(ManagedNode):
     def _on_reset(self, _: Any, response: Any) -> Any:
         if self._is_refused(response):
             return response
+        if self._keeper:
+            self._keeper.begin_anew()
         self._recorder.clear()
         self.faults.clear()
         self._inference.reset()
