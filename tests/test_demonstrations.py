@@ -6,7 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bnirl_ros.demonstrations.placement import episode_starts, pair_by_stamp, place
+from bnirl_ros.demonstrations.pairing import pair_by_stamp
+from bnirl_ros.demonstrations.placement import episode_starts, place
 from bnirl_ros.demonstrations.recording import Recorder
 from bnirl_ros.maps.grid_map import GridMap
 
@@ -175,3 +176,63 @@ def test_clear_forgets_everything() -> None:
     assert len(recorder) == 0
     assert not recorder.faults
     assert len(place(recorder.snapshot(), MAP).demonstration) == 0
+
+
+# Forgetting
+
+
+@given(
+    limit=st.integers(1, 30),
+    order=st.lists(st.sampled_from(["both", "pose", "action", "action first"]), max_size=120),
+    period=st.integers(5, 200),
+)
+def test_of_too_much_the_oldest_is_forgotten_and_the_rest_is_as_if_it_was_all(
+    limit: int, order: list[str], period: int
+) -> None:
+    """Stamps go back once in a while, as in a replay that loops."""
+    bounded, whole = Recorder(limit=limit), Recorder()
+    drained: list[int] = []
+    for number, what in enumerate(order):
+        stamp = number % period
+        parts = {"both": "pa", "pose": "p", "action": "a", "action first": "ap"}[what]
+        for recorder in (bounded, whole):
+            for part in parts:
+                if part == "p":
+                    recorder.add_pose(stamp, "map", float(number), 0.0)
+                else:
+                    recorder.add_action(stamp, 1.0, 0.0)
+        if number % 3 == 0:
+            drained += bounded.drain().positions[:, 0].astype(int).tolist()
+    left, all_of_it = bounded.snapshot(), whole.snapshot()
+    poses, actions = left.forgotten
+    assert len(bounded) == len(whole) == left.messages == all_of_it.messages
+    assert max(len(left.pose_stamps), len(left.actions)) <= limit
+    np.testing.assert_array_equal(left.positions, all_of_it.positions[poses:])
+    np.testing.assert_array_equal(left.action_stamps, all_of_it.action_stamps[actions:])
+    assert sum(bounded.faults.values()) == poses + actions
+    # What is drained in time is drained whole, forgotten or not.
+    drained += bounded.drain().positions[:, 0].astype(int).tolist()
+    if limit >= 6:
+        assert drained == all_of_it.positions[:, 0].astype(int).tolist()
+
+
+def test_poses_that_are_kept_keep_their_actions_and_their_numbers() -> None:
+    bounded, whole = Recorder(limit=100), Recorder()
+    for recorder in (bounded, whole):
+        for number in range(350):
+            stamp = number * 500_000_000
+            recorder.add_pose(stamp, "map", 0.5 + number % 2, 0.5)
+            if number % 10:
+                recorder.add_action(stamp, 1.0 - 2.0 * (number % 2), 0.0)
+    grid_map = GridMap(np.ones((1, 2), dtype=bool))
+    some, everything = (place(each.snapshot(), grid_map) for each in (bounded, whole))
+    assert 70 < len(some.poses) <= 100
+    assert some.messages == everything.messages
+    known = np.isin(everything.poses, some.poses)
+    np.testing.assert_array_equal(everything.poses[known], some.poses)
+    np.testing.assert_array_equal(everything.demonstration.cells[known], some.demonstration.cells)
+    np.testing.assert_array_equal(
+        everything.demonstration.action[known], some.demonstration.action
+    )
+    assert known[np.argmax(known) :].all()
+    assert some.faults["action without a pose of its stamp"] == 0

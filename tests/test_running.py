@@ -149,6 +149,21 @@ def test_feature_subgoals_go_on_by_their_coordinates() -> None:
         assert len(now.counts) == len(plain._candidates) != len(was.counts)
 
 
+def test_chains_go_on_where_the_oldest_was_forgotten() -> None:
+    settings, recorder = replace(SETTINGS, sweeps=300, burn_in=100), Recorder(limit=60)
+    running = None
+    for round_ in range(4):
+        record_round(recorder, round_, CORNERS)
+        running = RunningPosterior(place(recorder.snapshot(), MAP), MAP, settings, running)
+        finished(running)
+    assert running is not None
+    assert recorder.snapshot().forgotten[0] > 0
+    fresh = infer(running.placement.demonstration, MAP, settings)
+    assert subgoals_of(
+        running._candidates.coordinates, running.posterior().mode.subgoal_of
+    ) == subgoals_of(fresh.candidates.coordinates, fresh.mode.subgoal_of)
+
+
 def test_memory_is_bounded_and_draws_span_all_sweeps() -> None:
     running = RunningPosterior(placed(1), MAP, replace(SETTINGS, sweeps=20 * CAPACITY))
     sweeps = []

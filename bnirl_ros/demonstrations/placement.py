@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bnirl_ros.demonstrations.demonstration import Demonstration
+from bnirl_ros.demonstrations.pairing import pair_by_stamp
 from bnirl_ros.demonstrations.recording import Recording
 from bnirl_ros.maps.grid_map import GridMap
 from bnirl_ros.mdp.actions import ACTION_SETS
@@ -23,10 +24,10 @@ class Placement:
 
     Attributes:
         demonstration: its N observations.
-        poses: (N,) index into the recording's poses of each observation: as a recording only
-            grows, that tells which observations are the same in a later placement.
+        poses: (N,) number of the pose of each observation, counted with those that the recording
+            has forgotten: that tells which observations are the same in a later placement.
         last_poses: (L,) the same of each last pose without an action.
-        messages: number of poses and actions that the recording had.
+        messages: number of poses and actions that the recording had, forgotten ones included.
         faults: what did not fit, counted by fault.
     """
 
@@ -88,6 +89,7 @@ def place(
 
     kept = last_pose & free
     numbers = np.unique(episode[observed])
+    numbers_of_poses = np.flatnonzero(in_frame) + recording.forgotten[0]
     demonstration = Demonstration(
         episode=np.searchsorted(numbers, episode[observed]),
         cells=cells[observed],
@@ -97,9 +99,9 @@ def place(
     )
     return Placement(
         demonstration=demonstration,
-        poses=np.flatnonzero(in_frame)[observed],
-        last_poses=np.flatnonzero(in_frame)[kept],
-        messages=len(recording.pose_stamps) + len(recording.actions),
+        poses=numbers_of_poses[observed],
+        last_poses=numbers_of_poses[kept],
+        messages=recording.messages,
         faults=faults,
     )
 
@@ -122,36 +124,3 @@ def episode_starts(
     apart = (np.abs(steps[:, 0]) > 1) | (np.abs(steps[:, 1]) > 1)
     ends = (elapsed < 0) | (elapsed > episode_gap * 1e9) | apart
     return np.concatenate([np.ones(min(len(stamps), 1), dtype=bool), ends])
-
-
-def pair_by_stamp(
-    stamps: npt.NDArray[np.int64], others: npt.NDArray[np.int64]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Indices into `stamps` (P,) and `others` (Q,) of the pairs with equal stamps.
-
-    Where a stamp occurs several times, as when a bag is played in a loop, the first of one pairs
-    with the first of the other, the second with the second, and so on. Each is used once at most.
-    """
-    if (np.diff(stamps) > 0).all() and (np.diff(others) > 0).all():  # as nearly always
-        place = np.searchsorted(others, stamps)
-        first = np.flatnonzero(place < len(others))
-        first = first[others[place[first]] == stamps[first]]
-        return first, place[first]
-    stamp = np.concatenate([stamps, others])
-    is_other = np.arange(len(stamp)) >= len(stamps)
-    occurrence = np.concatenate([_occurrence(stamps), _occurrence(others)])
-    order = np.lexsort((is_other, occurrence, stamp))
-    before, after = order[:-1], order[1:]
-    is_pair = (stamp[before] == stamp[after]) & (occurrence[before] == occurrence[after])
-    first = np.argsort(before[is_pair])
-    return before[is_pair][first], after[is_pair][first] - len(stamps)
-
-
-def _occurrence(stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """(P,) how many equal stamps come before each."""
-    order = np.argsort(stamps, kind="stable")
-    in_order = stamps[order]
-    starts = np.searchsorted(in_order, in_order)
-    occurrence = np.empty(len(stamps), dtype=np.int64)
-    occurrence[order] = np.arange(len(stamps)) - starts
-    return occurrence

@@ -11,7 +11,10 @@ from threading import Lock
 import numpy as np
 import numpy.typing as npt
 
+from bnirl_ros.demonstrations.pairing import pair_by_stamp
 from bnirl_ros.mdp.actions import action_of_step
+
+_TOO_MANY = "oldest pose or action, where there are more than are kept"
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +28,7 @@ class Recording:
         frames: the frames that occur.
         action_stamps: (Q,) int64 [ns].
         actions: (Q,) int64 index into `ACTION_NAMES`.
+        forgotten: how many poses, and actions, came before these and were forgotten.
     """
 
     pose_stamps: npt.NDArray[np.int64]
@@ -33,6 +37,12 @@ class Recording:
     frames: tuple[str, ...]
     action_stamps: npt.NDArray[np.int64]
     actions: npt.NDArray[np.int64]
+    forgotten: tuple[int, int] = (0, 0)
+
+    @property
+    def messages(self) -> int:
+        """Number of poses and actions, those that were forgotten among them."""
+        return len(self.pose_stamps) + len(self.actions) + sum(self.forgotten)
 
 
 class Recorder:
@@ -41,12 +51,18 @@ class Recorder:
     One thread may add while another takes snapshots.
 
     Attributes:
-        faults: how often each fault occurred among the messages that were refused.
+        faults: how often each fault occurred among the messages that were refused or forgotten.
     """
 
-    def __init__(self, waiting_limit: int = 40_000) -> None:
-        """`waiting_limit`: how many poses, and actions, may wait for the first map."""
-        self._waiting_limit = waiting_limit
+    def __init__(self, waiting_limit: int = 40_000, limit: int | None = None) -> None:
+        """Nothing has come yet.
+
+        Args:
+            waiting_limit: how many poses, and actions, may wait for the first map.
+            limit: how many poses, and actions, are kept: of more the oldest eighth is forgotten,
+                poses with their actions. None for no limit.
+        """
+        self._waiting_limit, self._limit = waiting_limit, limit
         self._lock = Lock()
         self._waiting = True
         self.clear()
@@ -61,7 +77,7 @@ class Recorder:
             self._pose_frames = array("q")
             self._action_stamps = array("q")
             self._actions = array("q")
-            self._drained = 0, 0  # poses and actions
+            self._forgotten = self._drained = 0, 0  # poses and actions
 
     def map_arrived(self) -> None:
         """There is a map now: nothing has to wait for one any more."""
@@ -86,6 +102,7 @@ class Recorder:
             self._pose_stamps.append(stamp)
             self._positions.extend((x, y))
             self._pose_frames.append(self._frames.setdefault(frame_id, len(self._frames)))
+            self._forget_what_is_too_old()
         return None
 
     def add_action(self, stamp: int, dx: float, dy: float) -> str | None:
@@ -102,6 +119,7 @@ class Recorder:
         with self._lock:
             self._action_stamps.append(stamp)
             self._actions.append(action)
+            self._forget_what_is_too_old()
         return None
 
     def restore(self, recording: Recording) -> None:
@@ -113,26 +131,37 @@ class Recorder:
             self._pose_frames.extend(numbers[frame] for frame in recording.pose_frames.tolist())
             self._action_stamps.extend(recording.action_stamps.tolist())
             self._actions.extend(recording.actions.tolist())
-            self._drained = len(self._pose_stamps), len(self._actions)
+            self._drained = self._taken
+            self._forget_what_is_too_old()
 
     def __len__(self) -> int:
-        """Number of messages taken in."""
-        return len(self._pose_stamps) + len(self._action_stamps)
+        """Number of messages taken in, those that were forgotten among them."""
+        return sum(self._taken)
 
     def snapshot(self) -> Recording:
-        """All that was taken in so far, as arrays of its own."""
+        """All that was taken in so far and is not forgotten, as arrays of its own."""
         with self._lock:
-            return self._since(0, 0)
+            return self._since(self._forgotten)
 
     def drain(self) -> Recording:
         """What was taken in since the last call, for one who keeps it elsewhere."""
         with self._lock:
-            new = self._since(*self._drained)
-            self._drained = len(self._pose_stamps), len(self._actions)
+            new = self._since(self._drained)
+            self._drained = self._taken
         return new
 
-    def _since(self, pose: int, action: int) -> Recording:
-        """What was taken in from a pose and an action on, by their numbers."""
+    @property
+    def _taken(self) -> tuple[int, int]:
+        """How many poses and actions were taken in."""
+        poses, actions = self._forgotten
+        return poses + len(self._pose_stamps), actions + len(self._actions)
+
+    def _since(self, taken: tuple[int, int]) -> Recording:
+        """What was taken in after so many poses and actions, and is not forgotten."""
+        first = tuple(
+            max(0, count - gone) for count, gone in zip(taken, self._forgotten, strict=True)
+        )
+        pose, action = first
         return Recording(
             pose_stamps=np.array(self._pose_stamps[pose:], dtype=np.int64),
             positions=np.array(self._positions[2 * pose :], dtype=np.float64).reshape(-1, 2),
@@ -140,7 +169,27 @@ class Recorder:
             frames=tuple(self._frames),
             action_stamps=np.array(self._action_stamps[action:], dtype=np.int64),
             actions=np.array(self._actions[action:], dtype=np.int64),
+            forgotten=(self._forgotten[0] + pose, self._forgotten[1] + action),
         )
+
+    def _forget_what_is_too_old(self) -> None:
+        """Forget the oldest where there is too much: a lot at once, so that it is rare."""
+        most = max(len(self._pose_stamps), len(self._actions))
+        if self._limit is None or most <= self._limit:
+            return
+        excess = [len(each) - self._limit for each in (self._pose_stamps, self._actions)]
+        poses, at_least = (each + self._limit // 8 if each > 0 else 0 for each in excess)
+        paired, with_action = pair_by_stamp(
+            np.array(self._pose_stamps, dtype=np.int64),
+            np.array(self._action_stamps, dtype=np.int64),
+        )
+        # Of the actions those before the first one of any pose that is kept.
+        kept = with_action[paired >= poses]
+        actions = max(at_least, int(kept.min()) if len(kept) else 0)
+        self.faults[_TOO_MANY] += poses + actions
+        del self._pose_stamps[:poses], self._positions[: 2 * poses], self._pose_frames[:poses]
+        del self._action_stamps[:actions], self._actions[:actions]
+        self._forgotten = self._forgotten[0] + poses, self._forgotten[1] + actions
 
     def _refuse(self, fault: str) -> str:
         self.faults[fault] += 1

@@ -73,4 +73,4 @@ class BackgroundWatch(Worker):
         with self._wake:
             if intent_filter is self._filter and intent is not None:
                 self._intent = intent
-                self._stamp = int(recording.pose_stamps[intent.pose])
+                self._stamp = int(recording.pose_stamps[intent.pose - recording.forgotten[0]])

@@ -62,6 +62,16 @@ PARAMETERS = (
         Limits("poses, and actions, that may wait for the first map", lowest=0, highest=1e7),
     ),
     NodeParameter(
+        "observation_limit",
+        100_000,
+        Limits(
+            "poses, and actions, that are kept and inferred from: of more the oldest eighth is "
+            "forgotten",
+            lowest=8,
+            highest=1e8,
+        ),
+    ),
+    NodeParameter(
         "features",
         "",
         Limits("file with features of the map's cells, for feature subgoals; empty: none"),
@@ -207,7 +217,7 @@ class SubgoalNode(ManagedNode):
         self._saved_waypoints: Waypoints | None = None
         if waypoints := self.file("waypoints_file"):
             self._saved_waypoints = read_waypoints(waypoints)
-        self._recorder = Recorder(values["waiting_limit"])
+        self._recorder = Recorder(values["waiting_limit"], values["observation_limit"])
         self._keeper = keeper = self._journal(values)
         self._outputs = self.advertise(OUTPUTS)
         self._shown: dict[str, Message] = {}  # the last messages on what is pursued now
