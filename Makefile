@@ -20,6 +20,8 @@ REPRODUCE_ARGS ?=
 OVERCOOKED ?= ../shared/data/overcooked
 # Further arguments for the campaign of damage, such as CAMPAIGN_ARGS='--cuts 10 --changes 50'.
 CAMPAIGN_ARGS ?=
+# Further arguments for the long load, such as SOAK_ARGS='--minutes 5 --limit 20000'.
+SOAK_ARGS ?=
 # Recordings of others, for `make campaigns`.
 BAGS ?= ../shared/data/bags
 # The recording of a turtlesim robot, for `make bags`.
@@ -80,9 +82,10 @@ benchmark: venv  ## Time the main job, its parts and the node, and see how cost 
 		$(BIN)/python benchmarks/$$name.py || failed=1; \
 	done; exit $$failed
 
-campaigns: venv  ## Damage bags and journals in thousands of ways, and see what is read of them
+campaigns: venv  ## Damage bags and journals in thousands of ways, and load the node for half an hour
 	$(BIN)/python -m bnirl_ros.experiments.journal_cuts
 	$(BIN)/python -m bnirl_ros.experiments.damage $(CAMPAIGN_ARGS) bags $(wildcard $(BAGS))
+	$(BIN)/python benchmarks/soak.py $(SOAK_ARGS)
 
 study: venv  ## Measure what the models find, into bnirl_out/study.md
 	$(BIN)/python -m bnirl_ros.experiments.study --overcooked "$(OVERCOOKED)" $(STUDY_ARGS)

@@ -46,6 +46,7 @@ SWEEPS = 20  # after which inference comes to its end, once no message comes any
 STEP, GAP = 100_000_000, 10_000_000_000  # [ns] by the stamps, between poses and between episodes
 WINDOW = 10.0  # [s] that a line of the table is about
 PATIENCE = 600.0  # [s] for what has to come
+LONGEST_WALK = 60_000  # observations
 TICKS = os.sysconf("SC_CLK_TCK")  # in a second of a processor's time
 
 
@@ -75,36 +76,55 @@ def walk(observations: int) -> Demonstration:
     return seen
 
 
-def take(path: Path) -> None:
-    """Run the subgoal node until it is stopped; then write when messages were sent and taken."""
+def take(path: Path, every: int = 1, **parameters: object) -> None:
+    """Run the subgoal node until it is stopped; then write when messages were sent and taken.
+
+    Args:
+        path: of an .npz with the times `sent` and `taken` [s], whether it `is_pose`, and the
+            `count` of messages.
+        every: how many messages one is noted of.
+        parameters: of the node.
+    """
     nodes = importlib.import_module("bnirl_ros.nodes.subgoal_node")
-    sent, taken = array("d"), array("d")
+    sent, taken, is_pose, count = array("d"), array("d"), array("b"), 0
+
+    def note(time_sent: float, of_pose: bool) -> None:
+        nonlocal count
+        if count % every == 0:
+            taken.append(time.monotonic())
+            sent.append(time_sent)
+            is_pose.append(of_pose)
+        count += 1
 
     class TimedNode(nodes.SubgoalNode):  # type: ignore[misc, name-defined]
         """Notes what messages tell of when they were sent."""
 
-        def _on_pose(self, message: Any) -> None:
-            taken.append(time.monotonic())
-            sent.append(message.pose.position.z)
-            super()._on_pose(message)
+        def _on_pose(self, message: Any, info: Any) -> None:
+            note(message.pose.position.z, True)
+            super()._on_pose(message, info)
 
-        def _on_action(self, message: Any) -> None:
-            taken.append(time.monotonic())
-            sent.append(message.vector.z)
-            super()._on_action(message)
+        def _on_action(self, message: Any, info: Any) -> None:
+            note(message.vector.z, False)
+            super()._on_action(message, info)
 
     nodes.SubgoalNode = TimedNode
-    settings = {"sweeps": SWEEPS, "burn_in": SWEEPS // 2}
-    words = [word for name, value in settings.items() for word in ("-p", f"{name}:={value}")]
+    given = {"sweeps": SWEEPS, "burn_in": SWEEPS // 2, **parameters}
+    words = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
     status = nodes.main(["--ros-args", *words])
-    np.savez(path, sent=np.array(sent), taken=np.array(taken))
+    arrays = {"sent": np.array(sent), "taken": np.array(taken), "is_pose": np.array(is_pose)}
+    np.savez(path, **arrays, count=count)
     sys.exit(status)
 
 
-def send(observations: int) -> None:
+def send(observations: int, rate: float = OBSERVATIONS_PER_SECOND) -> None:
     """Publish the map and a walk, in time; ends when all is acknowledged.
 
-    The height of a message, which the node does not read, tells when it was sent.
+    The height of a message, which the node does not read, tells when it was sent. A walk of more
+    than `LONGEST_WALK` observations begins again, with later stamps.
+
+    Args:
+        observations: how many, each with two messages.
+        rate: of observations [1/s].
     """
     rclpy, qos = importlib.import_module("rclpy"), importlib.import_module("rclpy.qos")
     conversion = importlib.import_module("bnirl_ros.nodes.conversion")
@@ -119,7 +139,8 @@ def send(observations: int) -> None:
         )
         for name, type_name in TOPIC_TYPES.items()
     }
-    grid_map, seen = PAPER_LOOP.grid_map, walk(observations)
+    grid_map, seen = PAPER_LOOP.grid_map, walk(min(observations, LONGEST_WALK))
+    episodes = int(seen.episode[-1]) + 1
     poses = {
         (x, y): conversion.to_ros(pose_message(grid_map, (x, y), 0))
         for x, y in np.unique(seen.cells, axis=0).tolist()
@@ -130,10 +151,11 @@ def send(observations: int) -> None:
     publishers["map"].publish(conversion.to_ros(map_message(grid_map, 0)))
     begin = time.monotonic()
     for number in range(observations):
-        stamp = STEP * number + GAP * int(seen.episode[number])
-        x, y = seen.cells[number].tolist()
-        pose, action = poses[x, y], actions[seen.action[number]]
-        time.sleep(max(0.0, begin + number / OBSERVATIONS_PER_SECOND - time.monotonic()))
+        round_, row = divmod(number, len(seen))
+        stamp = STEP * number + GAP * (int(seen.episode[row]) + episodes * round_)
+        x, y = seen.cells[row].tolist()
+        pose, action = poses[x, y], actions[seen.action[row]]
+        time.sleep(max(0.0, begin + number / rate - time.monotonic()))
         for name, message, place in (
             ("pose", pose, pose.pose.position),
             ("action", action, action.vector),
@@ -161,6 +183,11 @@ class Observer:
         diagnostics = importlib.import_module("diagnostic_msgs.msg").DiagnosticArray
         self._node.create_subscription(markers, "subgoals", self._on_subgoals, 10)
         self._node.create_subscription(diagnostics, "/diagnostics", self._on_diagnostics, 10)
+
+    def close(self) -> None:
+        """Look no longer."""
+        self._node.destroy_node()
+        self._rclpy.shutdown()
 
     def _on_subgoals(self, _: Any) -> None:
         self.results += 1

@@ -294,7 +294,7 @@ class Clumsy(ManagedNode):
     def health(self) -> Health:
         return Health("clumsiness", "failing", "", faults=self.faults)
 
-    def _fail(self, message: Any) -> None:
+    def _fail(self, message: Any, _: Any) -> None:
         raise ValueError(message.header.frame_id)
 
 

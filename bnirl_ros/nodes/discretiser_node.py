@@ -321,7 +321,7 @@ class DiscretiserNode(ManagedNode):
         """The map's frame, or what it will probably be."""
         return frame_name(self._motion.frame_id or self._settings.map_frame or "map")
 
-    def _on_map(self, message: Any) -> None:
+    def _on_map(self, message: Any, _: Mapping[str, int]) -> None:
         try:
             grid_map = map_of(message, "topic map")
         except InputError as error:
@@ -329,7 +329,7 @@ class DiscretiserNode(ManagedNode):
             return
         self._tell(self._motion.take_map(grid_map))
 
-    def _on_pose(self, message: Any) -> None:
+    def _on_pose(self, message: Any, _: Mapping[str, int]) -> None:
         pose = pose_of(message)
         if self._transforms and pose.frame_id != self._map_frame:
             self._pending.append((time.monotonic(), pose))
@@ -377,7 +377,7 @@ class DiscretiserNode(ManagedNode):
         if self._tells_no_time:  # stamps may be of another time, as when a bag is replayed
             self._tell(self._motion.advance(self.stamp() - round(_LATENESS * 1e9)))
 
-    def _on_intent(self, message: Any) -> None:
+    def _on_intent(self, message: Any, _: Mapping[str, int]) -> None:
         self._tell(self._motion.take_intent(command_of(message)))
 
     def _on_clock_jumped_back(self, _: Any) -> None:

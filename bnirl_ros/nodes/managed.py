@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from bnirl_ros.limits import Limits
 from bnirl_ros.nodes.conversion import message_class, to_ros
 from bnirl_ros.nodes.parameters import Changeable, NodeParameter, declare
 from bnirl_ros.nodes.process import run, spin
+from bnirl_ros.nodes.subscriptions import Losses
 from bnirl_ros.nodes.topics import NodeTopic
 from bnirl_ros.terminal_text import plain
 from bnirl_ros.views.diagnostics import Health, diagnostic_array
@@ -184,21 +184,39 @@ class ManagedNode(LifecycleNode):
         return publishers
 
     def hear(
-        self, topic: str, type_name: str, callback: Callable[..., None], qos: QoSProfile
+        self,
+        topic: str,
+        type_name: str,
+        callback: Callable[[Any, Mapping[str, int]], None],
+        qos: QoSProfile,
     ) -> Any:
         """Hear a topic until the node is deactivated; lost messages are counted.
 
         So is one on which the callback fails, and the node lives on.
 
+        Args:
+            topic, type_name: of the messages.
+            callback: takes a message, and what rclpy knows of its way.
+            qos: of the subscription, unless it is overridden.
+
         Returns:
             The subscription.
         """
+        losses = Losses(lambda: subscription.get_publisher_count())
+
+        def on_lost(event: Any) -> None:
+            self._count_lost(losses.told(event.total_count_change))
+
+        def take(message: Any, info: Mapping[str, int]) -> None:
+            self._count_lost(losses.taken(info["publication_sequence_number"]))
+            self._survive(callback, message, info)
+
         subscription = self.create_subscription(
             message_class(type_name),
             topic,
-            self._surviving(callback),
+            take,
             qos,
-            event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost),
+            event_callbacks=SubscriptionEventCallbacks(message_lost=on_lost),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
         self._heard.append(subscription)
@@ -285,19 +303,15 @@ class ManagedNode(LifecycleNode):
             return Path(value).expanduser()
         return inside(self._file_folder, Path(value), name)
 
-    def _surviving(self, callback: Callable[..., None]) -> Callable[..., None]:
-        @wraps(callback)  # rclpy looks at what it takes
-        def take(*arguments: Any) -> None:
-            try:
-                callback(*arguments)
-            except Exception as error:
-                self.faults["message on which the node failed"] += 1
-                self.get_logger().error(
-                    plain(f"failed on a message: {type(error).__name__}: {error}"),
-                    throttle_duration_sec=_LOG_PERIOD,
-                )
-
-        return take
+    def _survive(self, callback: Callable[..., None], *arguments: Any) -> None:
+        try:
+            callback(*arguments)
+        except Exception as error:
+            self.faults["message on which the node failed"] += 1
+            self.get_logger().error(
+                plain(f"failed on a message: {type(error).__name__}: {error}"),
+                throttle_duration_sec=_LOG_PERIOD,
+            )
 
     def _tried(self, done: str, transition: Callable[[], None]) -> TransitionCallbackReturn:
         """What came of a part of a transition; a user's mistake is logged unless `start` tells."""
@@ -349,8 +363,9 @@ class ManagedNode(LifecycleNode):
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    def _on_lost(self, event: Any) -> None:
-        self.faults["message lost on its way"] += event.total_count_change
+    def _count_lost(self, count: int) -> None:
+        if count:
+            self.faults["message lost on its way"] += count
 
     def _publish_diagnostics(self) -> None:
         if not self.configured:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError
 from typing import Any
 
@@ -306,10 +306,10 @@ class SubgoalNode(ManagedNode):
         if self.configured:
             self._inference.use_settings(settings)
 
-    def _on_pose(self, message: Any) -> None:
+    def _on_pose(self, message: Any, _: Mapping[str, int]) -> None:
         self._taken(take_pose(self._recorder, message))
 
-    def _on_action(self, message: Any) -> None:
+    def _on_action(self, message: Any, _: Mapping[str, int]) -> None:
         self._taken(take_action(self._recorder, message))
 
     def _taken(self, fault: str | None) -> None:
@@ -317,7 +317,7 @@ class SubgoalNode(ManagedNode):
             self._inference.observations_arrived()
             self._watch.observations_arrived()
 
-    def _on_map(self, message: Any) -> None:
+    def _on_map(self, message: Any, _: Mapping[str, int]) -> None:
         try:
             grid_map = map_of(message, "topic map")
             is_new = self._grid_map is None or not grid_map.is_same_as(self._grid_map)
