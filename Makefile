@@ -20,6 +20,8 @@ REPRODUCE_ARGS ?=
 OVERCOOKED ?= ../shared/data/overcooked
 # Further arguments for the campaign of damage, such as CAMPAIGN_ARGS='--cuts 10 --changes 50'.
 CAMPAIGN_ARGS ?=
+# Arguments for the campaign of bad input: half a minute for each door, led by the code it reaches.
+FUZZING_ARGS ?= --guided 30
 # Further arguments for the long load, such as SOAK_ARGS='--minutes 5 --limit 20000'.
 SOAK_ARGS ?=
 # Recordings of others, for `make campaigns`.
@@ -82,7 +84,9 @@ benchmark: venv  ## Time the main job, its parts and the node, and see how cost 
 		$(BIN)/python benchmarks/$$name.py || failed=1; \
 	done; exit $$failed
 
-campaigns: venv  ## Damage bags and journals in thousands of ways, and load the node for half an hour
+campaigns: venv  ## Bad input for every door, damage, cuts, and half an hour of load
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[campaigns]'
+	$(BIN)/python -m bnirl_ros.experiments.fuzzing $(FUZZING_ARGS)
 	$(BIN)/python -m bnirl_ros.experiments.journal_cuts
 	$(BIN)/python -m bnirl_ros.experiments.damage $(CAMPAIGN_ARGS) bags $(wildcard $(BAGS))
 	$(BIN)/python benchmarks/soak.py $(SOAK_ARGS)

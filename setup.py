@@ -31,6 +31,10 @@ EXTRAS = {
     "benchmark": [
         "quantecon>=0.7",
     ],
+    # libFuzzer for Python, Google's: looks for input that reaches further code.
+    "campaigns": [
+        "atheris>=3.0",
+    ],
     # A cluster to infer on, of which `bnirl infer --scheduler` is a client.
     "dask": [
         "distributed>=2024.1",

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from bnirl_ros.demonstrations.messages import stamp_of
 
 _SECOND = 1e9
+_FARTHEST = 1e12  # [m]: the squares of what lies farther away, as some leave it, may overflow
 
 
 class TransformBuffer:
@@ -171,8 +172,9 @@ def _pq_of(transform: Any) -> npt.NDArray[np.float64]:
     """(7,) position and unit quaternion, real part first; not finite where there is none."""
     shift, turn = transform.translation, transform.rotation
     pq = np.array([shift.x, shift.y, shift.z, turn.w, turn.x, turn.y, turn.z])
-    length = np.linalg.norm(pq[3:])
-    pq[3:] /= length if length >= 1e-6 else math.nan
+    length = math.hypot(*pq[3:])
+    pq[3:] = pq[3:] / length if 1e-6 <= length < math.inf else math.nan
+    pq[:3][np.abs(pq[:3]) > _FARTHEST] = math.nan
     return pq
 
 

@@ -11,14 +11,12 @@ import argparse
 import os
 import random
 import resource
-import signal
 import struct
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -28,18 +26,13 @@ from mcap.opcode import Opcode
 
 from bnirl_ros.bags.reader import Bag
 from bnirl_ros.errors import InputError
+from bnirl_ros.experiments.restraint import limited_memory, patience
 
 CUTS = 100
 """Places at which each file is cut off."""
 
 CHANGES = 1000
 """Bytes of each file that are changed, one at a time."""
-
-PATIENCE = 60
-"""Seconds after which reading a file of a few hundred kilobytes counts as never ending."""
-
-MEMORY = 2**29
-"""Bytes by which the memory of the process that reads may grow."""
 
 _MAGIC_SIZE = 8
 _FRAME = struct.Struct("<BQ")
@@ -179,7 +172,7 @@ def campaign(path: Path, cuts: int = CUTS, changes: int = CHANGES) -> Result:
     stretches = stretches_of(data)
     problems, slowest = [], 0.0
     damages = damages_of(data, cuts, changes)
-    with TemporaryDirectory() as folder, _limited(), _patience() as watched:
+    with TemporaryDirectory() as folder, limited_memory(), patience() as watched:
         for damage in damages:
             begun = time.monotonic()
             try:
@@ -219,40 +212,6 @@ def _unpacked(packed: bytes, compression: str) -> bytes:
     if compression == "lz4":
         return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed))
     return packed
-
-
-@contextmanager
-def _limited() -> Iterator[None]:
-    """Memory beyond what is taken now and `MEMORY` is refused."""
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEMORY, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, before)
-
-
-@contextmanager
-def _patience() -> Iterator[Callable[[], AbstractContextManager[None]]]:
-    """Gives a context in which `PATIENCE` ends with a TimeoutError."""
-
-    def stop(number: int, frame: object) -> None:
-        raise TimeoutError(f"no end after {PATIENCE} s")
-
-    @contextmanager
-    def watched() -> Iterator[None]:
-        signal.alarm(PATIENCE)
-        try:
-            yield
-        finally:
-            signal.alarm(0)
-
-    before = signal.signal(signal.SIGALRM, stop)
-    try:
-        yield watched
-    finally:
-        signal.signal(signal.SIGALRM, before)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

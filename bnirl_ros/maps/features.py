@@ -31,6 +31,9 @@ from bnirl_ros.maps.map_file import (
     read_keys,
 )
 
+_FARTHEST = 1e9  # [m] of a place, and
+_SMALLEST_STEP = 1e-6  # [m] of distances to it, so that they can be counted
+
 
 class FeatureLayer(Protocol):
     """Whatever tells features of the cells of any map."""
@@ -193,12 +196,17 @@ def _places(content: Mapping[str, Any], file: Path) -> PlaceLayer:
     positions = []
     for name, place in places.items():
         numbers = [as_number(item) for item in place] if isinstance(place, list) else []
-        if len(numbers) != 2 or not np.isfinite(numbers).all():
-            raise InputError(f"{file}: place {name} is {place!r}; it must be [x, y] in metres")
+        if len(numbers) != 2 or not (np.abs(numbers) <= _FARTHEST).all():
+            raise InputError(
+                f"{file}: place {name} is {place!r}; it must be [x, y] in metres, no farther away "
+                f"than {_FARTHEST:g}"
+            )
         positions.append(numbers)
     step = None
     if "step" in content:
         step = number_of(content, "step", file)
-        if step <= 0.0:
-            raise InputError(f"{file}: 'step' is {step:g}; it must be above 0 metres")
+        if step < _SMALLEST_STEP:
+            raise InputError(
+                f"{file}: 'step' is {step:g}; it must be {_SMALLEST_STEP:g} metres or more"
+            )
     return PlaceLayer(tuple(map(str, places)), np.array(positions), step)

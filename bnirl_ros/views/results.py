@@ -236,7 +236,9 @@ def subgoals_in(document: Mapping[str, Any]) -> tuple[Subgoal, ...]:
     return tuple(
         Subgoal(
             rank=entry["rank"],
-            cell=tuple(entry["cell"]) if entry["cell"] else middle_of(np.array(entry["cells"])),
+            cell=tuple(entry["cell"])
+            if entry["cell"]
+            else middle_of(np.array(entry["cells"], dtype=np.int64)),
             position=(entry["position"][0], entry["position"][1]),
             probability=entry["probability"],
             observations=entry["observations"],
