@@ -334,7 +334,7 @@ def test_features_of_places_are_manhattan_distances(tmp_path: Path) -> None:
         ("f.yaml", "places: {}", "f.yaml: 'places' is {}"),
         ("f.yaml", "places: {a: [1]}", r"place a is \[1\]; it must be \[x, y\] in metres"),
         ("f.yaml", "places: {a: [1, .inf]}", r"place a is \[1, inf\]"),
-        ("f.yaml", "places: {a: [1, 2]}\nstep: 0", "'step' is 0; it must be above 0"),
+        ("f.yaml", "places: {a: [1, 2]}\nstep: 0", "'step' is 0; it must be 1e-06 metres or more"),
     ],
 )
 def test_a_file_that_tells_no_features_is_refused_with_a_sentence(
