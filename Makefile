@@ -89,6 +89,7 @@ campaigns: venv  ## Bad input for every door, damage, cuts, and half an hour of 
 	$(BIN)/python -m bnirl_ros.experiments.fuzzing $(FUZZING_ARGS)
 	$(BIN)/python -m bnirl_ros.experiments.journal_cuts
 	$(BIN)/python -m bnirl_ros.experiments.damage $(CAMPAIGN_ARGS) bags $(wildcard $(BAGS))
+	$(BIN)/python benchmarks/lossy_network.py
 	$(BIN)/python benchmarks/soak.py $(SOAK_ARGS)
 
 study: venv  ## Measure what the models find, into bnirl_out/study.md

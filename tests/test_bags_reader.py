@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from mcap.opcode import Opcode
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
@@ -283,6 +284,21 @@ def test_a_message_too_short_does_not_cost_the_next(tmp_path: Path) -> None:
         f"damaged at byte {place} (a record claims 21 bytes, which none of its kind has)"
         in bag.damage
     )
+
+
+def test_a_byte_too_many_before_a_torn_index_is_damage_and_no_more(tmp_path: Path) -> None:
+    """It looks like the beginning of a chunk, in a file that was cut off in a later index."""
+    write_mcap(tmp_path / "sound.mcap", [1, 2, 3], topics=3)
+    data = (tmp_path / "sound.mcap").read_bytes()
+    places = {}
+    place = 8
+    while data[place] != Opcode.DATA_END:
+        places.setdefault(data[place], place)
+        place += 9 + int.from_bytes(data[place + 1 : place + 9], "little")
+    first, end = places[Opcode.MESSAGE_INDEX], place
+    bag = damaged(tmp_path, data[:first] + b"\x06" + data[first : end - 10])
+    assert numbers(bag.messages()) == [0, 1, 2]
+    assert f"at byte {first}" in (bag.damage or "")
 
 
 def test_random_damage_never_raises(tmp_path: Path) -> None:

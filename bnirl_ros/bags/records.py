@@ -349,7 +349,7 @@ def _is_cut_chunk(stream: IO[bytes], frame: Frame) -> bool:
 
 def _chunk_at(stream: IO[bytes], frame: Frame) -> ChunkHead:
     stream.seek(frame.start)
-    content = stream.read(min(64, frame.end - frame.start))
+    content = stream.read(max(0, min(64, frame.end - frame.start)))
     if len(content) < _CHUNK_HEAD.size:
         raise DamageError("a chunk breaks off")
     time, last_time, size, crc = _CHUNK_HEAD.unpack_from(content)

@@ -52,15 +52,17 @@ class GridMap:
     def cells_of(self, positions: npt.ArrayLike) -> npt.NDArray[np.int64]:
         """Cells (N, 2) in which the positions (N, 2) [m] lie; they may lie outside the map."""
         # Far positions would overflow int64 (undefined in C); a cell this far is outside any map.
-        cells = np.clip(np.floor(self.coordinates_of(positions)), -(2**62), 2**62)
-        return np.asarray(cells, dtype=np.int64)
+        cells = np.nan_to_num(np.floor(self.coordinates_of(positions)), nan=np.inf)
+        return np.asarray(np.clip(cells, -(2**62), 2**62), dtype=np.int64)
 
     def coordinates_of(self, positions: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """The positions (N, 2) [m] along the map's axes, in cells from its lower left corner."""
         x, y, yaw = self.origin
         offset = np.asarray(positions, dtype=np.float64).reshape(-1, 2) - (x, y)
         cosine, sine = np.cos(yaw), np.sin(yaw)
-        return np.asarray(offset @ np.array([[cosine, -sine], [sine, cosine]]) / self.resolution)
+        with np.errstate(over="ignore", invalid="ignore"):  # it is too far away, and that is all
+            turned = offset @ np.array([[cosine, -sine], [sine, cosine]])
+            return np.asarray(turned / self.resolution)
 
     def centres_of(self, cells: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Centres (N, 2) of the cells (N, 2) in the frame [m]."""

@@ -353,6 +353,8 @@ def _settings() -> Door:
             given = json.loads(data)
         except (ValueError, RecursionError) as fault:
             raise InputError("no values of Python") from fault
+        if not isinstance(given, dict):
+            raise InputError("values have names")
         for table in (Settings, Discretising):
             names = {each.name for each in fields(table)}
             table(**{name: value for name, value in given.items() if name in names})
