@@ -86,7 +86,7 @@ benchmark: venv  ## Time the main job, its parts and the node, and see how cost 
 
 campaigns: venv  ## Bad input for every door, damage, cuts, and half an hour of load
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[campaigns]'
-	$(BIN)/python -m bnirl_ros.experiments.fuzzing $(FUZZING_ARGS)
+	$(BIN)/python -m bnirl_ros.fuzzing $(FUZZING_ARGS)
 	$(BIN)/python -m bnirl_ros.experiments.journal_cuts
 	$(BIN)/python -m bnirl_ros.experiments.damage $(CAMPAIGN_ARGS) bags $(wildcard $(BAGS))
 	$(BIN)/python benchmarks/lossy_network.py

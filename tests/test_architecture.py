@@ -28,6 +28,7 @@ ORDER = [
     {"experiments"},
     {"nodes"},
     {"cli"},
+    {"fuzzing"},
 ]
 ROW = {room: row for row, rooms in enumerate(ORDER) for room in rooms}
 

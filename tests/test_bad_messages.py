@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import pytest
 
-from bnirl_ros.experiments.fuzzing.doors import door_called
-from bnirl_ros.experiments.fuzzing.mutation import mutated
+from bnirl_ros.fuzzing.doors import door_called
+from bnirl_ros.fuzzing.mutation import mutated
 from demonstration_support import (
     CORNERS,
     MAP,

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from bnirl_ros.errors import InputError
-from bnirl_ros.experiments.fuzzing.__main__ import main
-from bnirl_ros.experiments.fuzzing.campaign import campaign
-from bnirl_ros.experiments.fuzzing.doors import Door, doors
-from bnirl_ros.experiments.fuzzing.mutation import mutated
+from bnirl_ros.fuzzing.__main__ import main
+from bnirl_ros.fuzzing.campaign import campaign
+from bnirl_ros.fuzzing.doors import Door, doors
+from bnirl_ros.fuzzing.mutation import mutated
 
 DOORS = tuple(doors())
 

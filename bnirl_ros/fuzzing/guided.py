@@ -1,6 +1,6 @@
 """Bad input for one door, led by what code it reaches: a process of its own for libFuzzer.
 
-`python -m bnirl_ros.experiments.fuzzing.guided DOOR SECONDS FOLDER`. The fuzzer looks at which
+`python -m bnirl_ros.fuzzing.guided DOOR SECONDS FOLDER`. The fuzzer looks at which
 branches of the package an input takes, and changes further those that took new ones. Input that
 ends in a fault is left in the folder, and the status is not 0 then.
 """
@@ -69,10 +69,10 @@ def main(door_name: str, seconds: str, folder: str) -> None:
         # Numba cannot compile what was instrumented.
         importlib.import_module("bnirl_ros.inference.running")
     with atheris.instrument_imports(include=["bnirl_ros", "rosbags"]):
-        from bnirl_ros.experiments.fuzzing.campaign import entered
-        from bnirl_ros.experiments.fuzzing.doors import door_called
-        from bnirl_ros.experiments.fuzzing.mutation import mutated
         from bnirl_ros.experiments.restraint import patience
+        from bnirl_ros.fuzzing.campaign import entered
+        from bnirl_ros.fuzzing.doors import door_called
+        from bnirl_ros.fuzzing.mutation import mutated
     import random
 
     door = door_called(door_name)

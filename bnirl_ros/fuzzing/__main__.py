@@ -1,4 +1,4 @@
-"""Bad input for all doors: `python -m bnirl_ros.experiments.fuzzing --help`."""
+"""Bad input for all doors: `python -m bnirl_ros.fuzzing --help`."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
-from bnirl_ros.experiments.fuzzing.campaign import Account, campaign_of
-from bnirl_ros.experiments.fuzzing.doors import doors
-from bnirl_ros.experiments.fuzzing.guided import guided
+from bnirl_ros.fuzzing.campaign import Account, campaign_of
+from bnirl_ros.fuzzing.doors import doors
+from bnirl_ros.fuzzing.guided import guided
 
 INPUTS = 20_000
 """For each door."""

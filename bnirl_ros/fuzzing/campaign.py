@@ -14,9 +14,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from bnirl_ros.errors import InputError
-from bnirl_ros.experiments.fuzzing.doors import Door, door_called
-from bnirl_ros.experiments.fuzzing.mutation import mutated
 from bnirl_ros.experiments.restraint import limited_memory, patience
+from bnirl_ros.fuzzing.doors import Door, door_called
+from bnirl_ros.fuzzing.mutation import mutated
 
 
 @dataclass(frozen=True)
