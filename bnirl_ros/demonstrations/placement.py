@@ -12,7 +12,7 @@ from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.demonstrations.pairing import pair_by_stamp
 from bnirl_ros.demonstrations.recording import Recording
 from bnirl_ros.maps.grid_map import GridMap
-from bnirl_ros.mdp.actions import ACTION_SETS
+from bnirl_ros.mdp.actions import ACTION_NAMES, ACTION_SETS
 
 EPISODE_GAP = 2.0
 """Default time between two poses [s] beyond which a new episode begins."""
@@ -78,23 +78,27 @@ def place(
 
     on_map = grid_map.contains(cells)
     free = grid_map.is_free(cells)
-    possible = np.isin(action, ACTION_SETS[moves])
+    is_move = np.zeros(len(ACTION_NAMES) + 1, dtype=np.bool_)  # the last one is for none, -1
+    is_move[list(ACTION_SETS[moves])] = True
+    possible = is_move[action]
     observed = paired & free & possible
-    has_observation = np.isin(episode, episode[observed])
-    last_pose = last_of_episode & ~paired & has_observation
+    # By tables instead of sets: this is done whenever a message comes.
+    is_told = np.zeros(len(episode) + 1, dtype=np.bool_)
+    is_told[episode[observed]] = True
+    number = np.cumsum(is_told) - 1
+    last_pose = last_of_episode & ~paired & is_told[episode]
     count("pose outside the map", ~on_map)
     count("pose in a blocked cell", on_map & ~free)
     count("pose without an action of its stamp", ~paired & ~last_pose)
     count(f"action that is none of the {moves} moves", paired & ~possible)
 
     kept = last_pose & free
-    numbers = np.unique(episode[observed])
     numbers_of_poses = np.flatnonzero(in_frame) + recording.forgotten[0]
     demonstration = Demonstration(
-        episode=np.searchsorted(numbers, episode[observed]),
+        episode=number[episode[observed]],
         cells=cells[observed],
         action=action[observed],
-        last_episode=np.searchsorted(numbers, episode[kept]),
+        last_episode=number[episode[kept]],
         last_cells=cells[kept],
     )
     return Placement(
