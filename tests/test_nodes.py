@@ -257,6 +257,7 @@ def test_waypoints_belief_and_assignments_are_of_the_same_subgoals(
 def test_assignments_come_at_most_once_a_second(subgoals: Callable[..., Subgoals]) -> None:
     node = subgoals(sweeps=100_000_000, burn_in=0)
     node.send([map_of_grid()], walk())
+    node.peer.until(lambda: node.outputs["assignments"], "a first result")  # kernels are there
     for seed in range(40):  # each change brings a result at once
         node.set(seed=seed)
         node.peer.rest(0.1)
