@@ -154,10 +154,10 @@ def places_in(markers: Any) -> set[tuple[float, float]]:
     }
 
 
-def test_nodes_in_namespaces_of_their_own_do_not_hear_each_other(
+def test_ten_nodes_in_namespaces_of_their_own_do_not_hear_each_other(
     start: Callable[..., NodeProcess], peer: Peer
 ) -> None:
-    names = [f"robot{number}" for number in range(3)]
+    names = [f"robot{number}" for number in range(10)]
     nodes = [start("subgoal_node", *as_arguments(QUICK), "-r", f"__ns:=/{name}") for name in names]
     shown = {
         name: peer.listen(message_class("visualization_msgs/msg/MarkerArray"), f"/{name}/subgoals")

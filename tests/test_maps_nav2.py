@@ -10,6 +10,7 @@ import yaml
 from PIL import Image
 
 from bnirl_ros.errors import InputError
+from bnirl_ros.experiments.restraint import limited_memory
 from bnirl_ros.maps import GridMap, load_map, read_nav2_map
 
 SHARED_MAPS = Path(__file__).resolve().parents[2] / "shared" / "data" / "maps"
@@ -242,3 +243,14 @@ def test_an_image_that_would_fill_the_memory_is_refused_by_its_header(tmp_path):
     for width, says in ((8_000, "8000 x 8000 cells, more than"), (40_000, "is too large")):
         image.write_bytes(b"P5\n%d %d\n255\n" % (width, width))
         assert says in refusal(path)
+
+
+def test_a_length_in_an_image_that_its_file_does_not_have_reserves_no_memory(tmp_path):
+    path = write_map(tmp_path, grey([255, 255, 0]))
+    image = tmp_path / "map.png"
+    whole = image.read_bytes()
+    length_at = whole.index(b"IDAT") - 4
+    image.write_bytes(whole[:length_at] + b"\xff\xff\xff\xf0" + whole[length_at + 4 :])
+    with limited_memory() as grown:
+        assert read_nav2_map(path).free.tolist() == [[True, True, False]]
+    assert grown() < 2**28

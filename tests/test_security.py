@@ -137,10 +137,12 @@ def nested_aliases(levels: int) -> str:
         ("!!int ''", "not valid YAML"),
         ("!!timestamp soon", "not valid YAML"),
         ("0000-01-01", "not valid YAML"),
+        ("0x" + "f" * 5000, "not valid YAML"),
+        ("1" + ":30" * 1_000_000, "not valid YAML"),
         ("? [a, b]\n: 1\n? {}", "not valid YAML"),
         ("*nobody", "not valid YAML"),
     ],
-    ids=range(16),
+    ids=range(18),
 )
 def test_yaml_that_runs_or_explodes_is_refused_in_a_sentence(text: str, words: str) -> None:
     with pytest.raises(InputError, match=words):

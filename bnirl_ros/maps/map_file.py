@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import math
+import os
 import struct
 import warnings
 from collections.abc import Callable, Mapping
@@ -119,7 +121,10 @@ def read_image(
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             # Only these: Pillow would run an interpreter for some other formats.
-            with Image.open(image_path, formats=("PPM", "PNG", "BMP")) as image:
+            with (
+                _File(io.FileIO(image_path)) as file,
+                Image.open(file, formats=("PPM", "PNG", "BMP")) as image,
+            ):
                 check_geometry(image.width, image.height, resolution, origin, str(path))
                 return read(image)
     except InputError:
@@ -137,3 +142,12 @@ def read_image(
         raise InputError(
             f"{path}: the image {image_path} cannot be read; save it again as PGM, PNG or BMP"
         ) from None
+
+
+class _File(io.BufferedReader):
+    """A file of which no more is asked than it holds: a read reserves all that is asked."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """What there is of so many bytes; all for None or a negative number."""
+        left = max(os.fstat(self.fileno()).st_size - self.tell(), 0)
+        return super().read(left if size is None or size < 0 else min(size, left))
