@@ -39,6 +39,7 @@ class KnownGoals:
         self._kept_in = np.empty(0, dtype=np.int64)  # states, ascending
         self._of_goal: dict[bytes, npt.NDArray[np.float64]] = {}  # (states, A) for each
         self._asked = np.empty(0, dtype=np.int64), Goals.of_sets([])  # last
+        self._lane_of: dict[bytes, int] = {}  # of the goals in the last answer
         self._answer = np.empty((0, len(world.actions), 0))
 
     def of(self, states: npt.NDArray[np.int64], goals: Goals) -> npt.NDArray[np.float64]:
@@ -56,12 +57,45 @@ class KnownGoals:
         ):
             keys = self._have(states, goals)
             rows = np.searchsorted(self._kept_in, states)
-            by_goal = np.empty((len(goals), len(states) * len(self.world.actions)))
-            for lane, key in enumerate(keys):
-                self._of_goal[key].take(rows, axis=0, out=by_goal[lane].reshape(len(states), -1))
-            answer = np.ascontiguousarray(by_goal.T).reshape(len(states), -1, len(goals))
+            answer = self._with_one_more(states, keys, rows)
+            if answer is None:
+                by_goal = np.empty((len(goals), len(states) * len(self.world.actions)))
+                for lane, key in enumerate(keys):
+                    self._of_goal[key].take(
+                        rows, axis=0, out=by_goal[lane].reshape(len(states), -1)
+                    )
+                answer = np.ascontiguousarray(by_goal.T).reshape(len(states), -1, len(goals))
             self._asked, self._answer = (states, goals), answer
+            self._lane_of = dict(zip(keys, range(len(keys)), strict=True))
         return self._answer
+
+    def _with_one_more(
+        self,
+        states: npt.NDArray[np.int64],
+        keys: list[bytes],
+        rows: npt.NDArray[np.int64],
+    ) -> npt.NDArray[np.float64] | None:
+        """The last answer with a further state, a further goal, or both; None if that is not all.
+
+        To copy it takes a third of the time that it takes to gather it.
+        """
+        before, known = self._asked[0], self._lane_of
+        new = np.flatnonzero(~np.isin(states, before))
+        lanes = [lane for lane, key in enumerate(keys) if key not in known]
+        if (
+            len(new) > 1
+            or len(lanes) > 1
+            or len(states) - len(new) != len(before)
+            or [known[key] for key in keys if key in known] != list(range(len(known)))
+        ):
+            return None
+        answer = self._answer
+        for row in new:
+            of_state = [self._of_goal[key][rows[row]] for key in known]
+            answer = np.insert(answer, row, np.array(of_state).T, axis=0)
+        for lane in lanes:
+            answer = np.insert(answer, lane, self._of_goal[keys[lane]][rows], axis=2)
+        return answer
 
     def prepare(self, state: int) -> None:
         """Solve what a step from a state to a cell that was never visited will ask for."""

@@ -20,6 +20,7 @@ from numba import njit
 
 from bnirl_ros.inference.draws import Draws
 from bnirl_ros.inference.kernels import categorical, number_in_order
+from bnirl_ros.mdp.distinct import ascending
 from bnirl_ros.model.mixture import SubgoalMixture
 
 _VANISHING = -50.0  # [nats] what is so much less probable than another changes no sum of doubles
@@ -78,7 +79,7 @@ def kernel_model(mixture: SubgoalMixture) -> _Model:
         prior=np.exp(mixture.log_prior),
         eta=float(mixture.eta),
         pair_of=mixture.pair_of,
-        by_pair=np.argsort(first[mixture.pair_of], kind="stable"),
+        by_pair=ascending(first[mixture.pair_of], count),
     )
 
 

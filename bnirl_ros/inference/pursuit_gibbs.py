@@ -34,7 +34,7 @@ from bnirl_ros.inference.kernels import (
     number_in_order,
     row_sum,
 )
-from bnirl_ros.mdp.distinct import distinct
+from bnirl_ros.mdp.distinct import ascending, distinct
 from bnirl_ros.model.pursuits import (
     ALPHA,
     AT_SUBGOAL,
@@ -143,7 +143,7 @@ def kernel_model(model: PursuitModel) -> KernelModel:
         pair_of=pair_of,
         pair_state=pairs // actions,
         pair_action=pairs % actions,
-        by_pair=np.argsort(pair_of, kind="stable").astype(np.int64),
+        by_pair=ascending(pair_of, len(pairs)),
         near_first=np.concatenate([[0], np.cumsum(model.arrived.sum(axis=1))]).astype(np.int64),
         near=np.nonzero(model.arrived)[1].astype(np.int64),
         is_fixed=np.array([name in model.fixed for name in PRIORS]),

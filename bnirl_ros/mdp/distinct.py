@@ -1,4 +1,4 @@
-"""The distinct ones of many numbers."""
+"""Many numbers below a bound: the distinct ones, and their order."""
 
 from __future__ import annotations
 
@@ -20,3 +20,11 @@ def distinct(
     index = np.empty(bound, dtype=np.int64)
     index[found] = np.arange(len(found))
     return found, index[numbers]
+
+
+def ascending(numbers: npt.NDArray[np.int64], bound: int) -> npt.NDArray[np.int64]:
+    """As `np.argsort(numbers, kind="stable")`, of numbers from 0 below a bound.
+
+    Numpy sorts those of two bytes by their digits, which takes a fifteenth of the time.
+    """
+    return np.argsort(numbers.astype(np.min_scalar_type(bound)), kind="stable")
