@@ -287,16 +287,17 @@ def passes(side: int, count: int) -> float:
     """
     world = GridWorld(np.ones((side, side), dtype=np.bool_))
     swept = 0
-    sweep = band._sweep
+    name, first = ("_sweep_of_one", 2) if count == 1 else ("_sweep", 3)
+    sweep = getattr(band, name)
 
-    def counting(law: Any, neighbours: Any, *arguments: Any) -> int:
+    def counting(*arguments: Any) -> int:
         nonlocal swept
-        inner, outer = arguments[2:4]
+        inner, outer = arguments[first : first + 2]
         swept += outer - inner
-        return sweep(law, neighbours, *arguments)
+        return sweep(*arguments)
 
     with (
-        mock.patch.object(band, "_sweep", counting),
+        mock.patch.object(band, name, counting),
         mock.patch.object(first_passage, "settle", band.settle.py_func),
     ):
         world.first_passage(near_goals(world, count), BOUND)
