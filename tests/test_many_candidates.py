@@ -4,7 +4,7 @@ Found means that every true subgoal has more than twice as many pursuits as any 
 Demonstration 5 is the hardest: all pursuits of one subgoal may agree on a cell two steps beside
 the true one, some 5 nats below the truth, where the posterior itself has a few per cent. Before
 subgoals were relocated with all paths open, 10 of 30 seeds had not found the truth after 60
-sweeps; now 40 seeds took at most 36.
+sweeps; now 150 seeds from both starts took at most 30, and 99 in 100 of them 23.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -126,6 +128,49 @@ def test_the_filter_is_the_one_over_all_pairs_of_subgoals(seed: int) -> None:
             assert evidence[t - first] == pytest.approx(belief.sum(), rel=1e-9)
             belief = belief / belief.sum()
             np.testing.assert_allclose(forward[t - first], belief, atol=1e-10)
+
+
+@pytest.mark.parametrize("one_episode", [False, True])
+@pytest.mark.parametrize("seed", range(10))
+def test_the_evidence_of_many_weights_is_that_of_each_filter(seed: int, one_episode: bool) -> None:
+    generator = np.random.default_rng(seed)
+    model = random_model(seed, count=400)
+    if one_episode:  # so long that messages have to be scaled
+        part = model.state_part[model.state_of[0]]
+        stays = np.flatnonzero(model.state_part[model.state_of] == part)
+        model = replace(
+            model,
+            state_of=model.state_of[stays],
+            action_of=model.action_of[stays],
+            starts=np.arange(len(stays)) == 0,
+        )
+    parameters = parameters_drawn(model, generator)
+    kernel = pursuit_gibbs.kernel_model(model)
+    chosen = pursuit_gibbs.softmax_table(kernel, parameters[pursuit_gibbs.ALPHA])
+    for part in range(kernel.parts):
+        here = model.candidate_part == part
+        weights = generator.gamma(0.3, size=(9, len(here))) * here
+        weights /= weights.sum(axis=1, keepdims=True)
+        bounds = pursuit_gibbs._episode_bounds(kernel, part)
+        expected = np.zeros(9)
+        for first, end in bounds:
+            forward, evidence = np.empty((end - first, len(here))), np.empty(end - first)
+            for trial in range(9):
+                pursuit_gibbs.forward_pass(
+                    kernel,
+                    parameters,
+                    chosen,
+                    weights[trial],
+                    first,
+                    end,
+                    weights[trial],
+                    forward,
+                    evidence,
+                )
+                expected[trial] += np.log(evidence).sum()
+        if len(bounds):
+            told = pursuit_gibbs._log_evidence(kernel, parameters, chosen, weights, bounds)
+            np.testing.assert_allclose(told, expected, rtol=1e-9)
 
 
 def test_ascent_finds_the_largest_of_every_history() -> None:

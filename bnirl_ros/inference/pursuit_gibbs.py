@@ -8,8 +8,7 @@ A sweep draws, each given all else:
    integrated out: held as a variable they would keep a candidate that is in no pursuit from ever
    being tried. A switch depends on the old subgoal through rho alone, so that an observation costs
    O(G), not O(G^2). Blocks differ in length from sweep to sweep;
-2. the place of a subgoal among its neighbours, with all paths open. In the first sweeps, which
-   are to find the subgoals, all places are compared; later one that the likelihood proposes;
+2. the place of a subgoal among its neighbours, with all paths open;
 3. the switch probabilities, together with the switches to the same subgoal again, and eta, all
    parameters by slice sampling;
 4. partitions, given the subgoals, by the Chinese restaurant process that the urn collapses, and
@@ -49,15 +48,14 @@ from bnirl_ros.model.pursuits import (
 _SHORTEST_BLOCK, _LONGEST_BLOCK = 8, 1024  # observations; their logarithm is uniform
 _BLOCK_ENTRIES = 4_000_000  # of the forward messages: shorter blocks where candidates are many
 _SLICE = 0.7  # first width of a slice, of a logarithm
-_OVERHEAD = 200  # candidates for which an observation takes as long as for what is done once
-_RELOCATED = 4000  # observations, beyond which there is one relocation in a sweep
-_RELOCATIONS = 4  # in a sweep over few observations
-_SEARCH = 100  # sweeps, in which relocations are thorough; less than one in each beyond these
-_THOROUGH = 0.125  # share of those that are, from then on
-_FLATTENED = 0.25  # power of the likelihood by which a cell is proposed as a subgoal's place
-_AT_RANDOM = 0.1  # share of proposals that are any cell of the window
+_OVERHEAD = 2000  # candidates for which an observation takes as long as for all else in a sweep
+_RELOCATED = 4000  # observations, beyond which a subgoal is relocated less than once in a sweep
+_RELOCATIONS = 2  # in a sweep over few observations, when the subgoals have been found
+_SEARCH = 50  # sweeps that are to find the subgoals, with four times as many relocations
 _LANES = 40  # candidates open to a relocation, beyond which there are fewer relocations
-_HEAVY = 1e-6  # a weight above which a candidate's place matters to a relocation
+_HEAVY = 0.1  # a weight times the observations, above which a place matters to a relocation
+_SMALL = 1e-40  # probability of actions at which messages are scaled
+_SUMS = 4  # side by side
 _LN_2 = math.log(2.0)
 _FRACTION, _ONE = np.int64((1 << 52) - 1), np.int64(1023 << 52)  # bits of a float64
 _FARTHEST = 27.0  # logarithms and logits are not sought beyond
@@ -278,20 +276,20 @@ def _advance(  # type: ignore[no-untyped-def]
     """`chosen` (K, G) and `forward` (block, G) are room for the softmax table and a block."""
     _fill_softmax_table(model, state.parameters[ALPHA], chosen)
     scratch = np.empty(state.subgoal_of.shape[0], dtype=np.int32)
+    relocation_period = 1 + scratch.shape[0] // _RELOCATED
     relocations = min(1 + _RELOCATED // (1 + scratch.shape[0]), _RELOCATIONS)
-    search_period = 1 + scratch.shape[0] // _RELOCATED
     # A draw of alpha takes a new table, an exponential for each cost: it comes round so rarely
     # that this is less than a third of all work. What an observation takes besides its candidates
     # counts as so many of them.
-    overhead = _OVERHEAD * (1 + relocations)
+    overhead = _OVERHEAD // relocation_period
     period = 1 + 4 * model.cost.size // (scratch.shape[0] * (model.prior.shape[0] + overhead))
     for draw in range(log_joint.shape[0]):
         for _ in range(thin):
             _draw_blocks(model, state, chosen, forward, generator)
-            searching = state.sweeps[0] < _SEARCH and (state.sweeps[0] + 1) % search_period == 0
-            for _again in range(relocations):
-                thorough = searching or generator.random() < _THOROUGH
-                _relocate(model, state, chosen, thorough, generator)
+            if state.sweeps[0] % relocation_period == 0:
+                searching = state.sweeps[0] < _SEARCH
+                for _again in range(4 * relocations if searching else relocations):
+                    _relocate(model, state, chosen, generator)
             # Partitions depend on eta and on the switches, whose draws have them integrated out:
             # they come after these.
             _draw_switches(model, state, generator)
@@ -482,9 +480,8 @@ def _draw_block(model, state, chosen, forward, first, end, generator):  # type: 
     part = model.state_part[model.state_of[first]]
     weights = urn_weights(model, parameters[ETA], counts, part)
 
-    evidence = np.empty(end - first)
     new_theta, new_switched = _draw_path(
-        model, parameters, chosen, weights, theta, forward, evidence, first, end, generator
+        model, parameters, chosen, weights, theta, forward, first, end, generator
     )
     ratio = urn_ratio(model, parameters[ETA], counts, weights, new_theta, new_switched)
     ratio -= urn_ratio(
@@ -497,9 +494,7 @@ def _draw_block(model, state, chosen, forward, first, end, generator):  # type: 
 
 
 @njit(nogil=True, cache=True)
-def _draw_path(  # type: ignore[no-untyped-def]
-    model, parameters, chosen, weights, theta, forward, evidence, first, end, generator
-):
+def _draw_path(model, parameters, chosen, weights, theta, forward, first, end, generator):  # type: ignore[no-untyped-def]
     """Subgoals of observations `first` to `end` of one episode, and where they were switched to.
 
     By forward filtering, backward sampling: given the `weights`, the parameters, and the subgoals
@@ -518,6 +513,7 @@ def _draw_path(  # type: ignore[no-untyped-def]
     before = np.zeros(candidates)
     if not model.starts[first]:
         before[theta[first - 1]] = 1.0
+    evidence = np.empty(end - first)
     forward_pass(model, parameters, chosen, weights, first, end, before, forward, evidence)
 
     new_theta = np.empty(last - first, dtype=np.int32)
@@ -583,7 +579,7 @@ def urn_ratio(model, eta, counts, weights, theta, switched):  # type: ignore[no-
 
 
 @njit(nogil=True, cache=True)
-def _relocate(model, state, chosen, thorough, generator):  # type: ignore[no-untyped-def]
+def _relocate(model, state, chosen, generator):  # type: ignore[no-untyped-def]
     """One subgoal to a cell beside it, or not, all paths and switches being open meanwhile.
 
     Where all pursuits of a subgoal agree on a cell beside the true one, they would have to leave
@@ -591,45 +587,42 @@ def _relocate(model, state, chosen, thorough, generator):  # type: ignore[no-unt
     chain would stay there for long.
 
     The weights are drawn and held. Those in a window of 3 x 3 cells, but for other subgoals, are
-    permuted so that the subgoal's comes to lie at another of its cells. The prior of the weights
-    is the same for all permutations, P(g) being uniform, so each has the probability of all
-    actions given the weights, which forward filtering gives. A thorough step compares all cells of
-    the window: a Gibbs step. One that is not proposes a single cell, by what the observations that
-    pursue the subgoal say of each: its own for the most part, which ends the step before it has
-    cost anything, and otherwise a Metropolis-Hastings step, where the way back is proposed by the
-    path that has been drawn by then. Only paths over the candidates of weight and those compared
-    are open, a set that is the same for all permutations and has the present path in it.
+    permuted so that the subgoal's comes to lie at any of its cells. The prior of the weights is
+    the same for all permutations, P(g) being uniform, so each has the probability of all actions
+    given the weights, which forward filtering gives. Only paths over the candidates of weight and
+    the window are open, a set that is the same for all permutations and has the present path in
+    it.
     """
     weights = _draw_weights(model, state, generator)
-    # The odds go with the weights, so they are the same on the way back.
-    odds = np.where(weights > _HEAVY, np.sqrt(weights), 0.0)
+    heavy = _HEAVY / state.subgoal_of.shape[0]  # few candidates that are pursued weigh less
+    # Half of the time by their weights, which go with them: those pursued most come to it soonest.
+    by_weight = generator.random() < 0.5
+    odds = np.zeros(weights.shape[0])
+    for candidate in range(weights.shape[0]):
+        if weights[candidate] > heavy:
+            odds[candidate] = weights[candidate] if by_weight else 1.0
     subgoal = categorical(odds, row_sum(odds), generator)
+    left = model.place[subgoal, 0] - int(3.0 * generator.random())
+    bottom = model.place[subgoal, 1] - int(3.0 * generator.random())
     part = model.candidate_part[subgoal]
-    window = _window(model, weights, subgoal, generator)
-    options = window
-    proposed = np.ones(window.shape[0])
-    if not thorough:
-        proposed = _proposals(model, state, chosen, state.subgoal_of, subgoal, window)
-        target = window[categorical(proposed, 1.0, generator)]
-        options = window[(window == subgoal) | (window == target)]
-    if options.shape[0] < 2:
-        return
-    lanes, places = [], []
+    lanes, window = [], []
     for candidate in range(weights.shape[0]):
         if model.candidate_part[candidate] != part:
             continue
-        compared = (options == candidate).any()
-        if compared:
-            places.append(len(lanes))
-        if compared or weights[candidate] > _HEAVY:
+        light = weights[candidate] <= heavy
+        x, y = model.place[candidate]
+        inside = left <= x < left + 3 and bottom <= y < bottom + 3
+        if candidate == subgoal or (light and inside):
+            window.append(len(lanes))
+        if not light or inside:
             lanes.append(candidate)
         elif state.counts[candidate] > 0:
             return
     candidates = np.array(lanes)
-    longest = 0
     bounds = _episode_bounds(model, part)
-    for first, end in bounds:
-        longest = max(longest, end - first)
+    if len(window) < 2 or bounds.shape[0] == 0:
+        return
+    longest = (bounds[:, 1] - bounds[:, 0]).max()
     if longest * candidates.shape[0] > _BLOCK_ENTRIES:
         return
     if generator.random() * candidates.shape[0] > _LANES:  # as rare as it is expensive
@@ -637,106 +630,100 @@ def _relocate(model, state, chosen, thorough, generator):  # type: ignore[no-unt
     small = _restricted(model, candidates)
     likely = np.ascontiguousarray(chosen[:, candidates])
     forward = np.empty((longest, candidates.shape[0]))
-    evidence = np.empty(longest)
-    scores = np.zeros(options.shape[0])
-    trials = np.empty((options.shape[0], candidates.shape[0]))
-    light_weights = weights[options[options != subgoal]]
-    for option in range(options.shape[0]):
-        trial = weights[candidates]
+    light_weights = [weights[candidates[lane]] for lane in window if candidates[lane] != subgoal]
+    trials = np.empty((len(window), candidates.shape[0]))
+    for option in range(len(window)):
+        trials[option] = weights[candidates]
         place = 0
-        for other in range(options.shape[0]):
+        for other in range(len(window)):
             if other == option:
-                trial[places[other]] = weights[subgoal]
+                trials[option, window[other]] = weights[subgoal]
             else:
-                trial[places[other]] = light_weights[place]
+                trials[option, window[other]] = light_weights[place]
                 place += 1
-        trials[option] = trial
-        for first, end in bounds:
-            forward_pass(
-                small, state.parameters, likely, trial, first, end, trial, forward, evidence
-            )
-            scores[option] += np.log(evidence[: end - first]).sum()
-    if thorough:
-        likely_options = np.exp(scores - scores.max())
-        option = categorical(likely_options, likely_options.sum(), generator)
-    else:
-        option = 1 if options[0] == subgoal else 0
-    theta, switched = state.subgoal_of.copy(), state.switched.copy()
-    for first, end in bounds:
-        path, switched[first:end] = _draw_path(
+    scores = _log_evidence(small, state.parameters, likely, trials, bounds)
+    likely_options = np.exp(scores - scores.max())
+    option = categorical(likely_options, likely_options.sum(), generator)
+    for episode in range(bounds.shape[0]):
+        first, end = bounds[episode]
+        path, switched = _draw_path(
             small,
             state.parameters,
             likely,
             trials[option],
-            theta,
+            state.subgoal_of,
             forward,
-            evidence,
             first,
             end,
             generator,
         )
-        theta[first:end] = candidates[path]
-    if not thorough:
-        back = _proposals(model, state, chosen, theta, options[option], window)
-        ratio = scores[option] - scores[1 - option]
-        ratio += math.log(back[window == subgoal][0] / proposed[window == options[option]][0])
-        if generator.random() >= math.exp(min(0.0, ratio)):
-            return
-    state.subgoal_of[:] = theta
-    state.switched[:] = switched
+        state.subgoal_of[first:end] = candidates[path]
+        state.switched[first:end] = switched
     state.counts[:] = 0
-    count_draws(state.counts, theta, switched, 1)
+    count_draws(state.counts, state.subgoal_of, state.switched, 1)
 
 
 @njit(nogil=True, cache=True)
-def _window(model, weights, subgoal, generator):  # type: ignore[no-untyped-def]
-    """The subgoal and all light candidates of a window of 3 x 3 cells that it lies in."""
-    left = model.place[subgoal, 0] - int(3.0 * generator.random())
-    bottom = model.place[subgoal, 1] - int(3.0 * generator.random())
-    inside = []
-    for candidate in range(weights.shape[0]):
-        if model.candidate_part[candidate] != model.candidate_part[subgoal]:
-            continue
-        x, y = model.place[candidate]
-        within = left <= x < left + 3 and bottom <= y < bottom + 3
-        if candidate == subgoal or (within and weights[candidate] <= _HEAVY):
-            inside.append(candidate)
-    return np.array(inside)
+def _log_evidence(model, parameters, chosen, weights, bounds):  # type: ignore[no-untyped-def]
+    """(W,) log-probability of all actions in these episodes, given each of `weights` (W, G).
 
-
-@njit(nogil=True, cache=True)
-def _proposals(model, state, chosen, theta, subgoal, window):  # type: ignore[no-untyped-def]
-    """Probability of proposing each candidate of a window as the place of a subgoal.
-
-    By the likelihood of the actions that pursue it on the path `theta` (N,), flattened, since a
-    path that is drawn anew will suit the place.
+    What `forward_pass` tells, without keeping the messages: those of one observation do for all
+    weights in turn, and none waits for the one before, as messages of the next observation do.
     """
-    slip = state.parameters[SLIP]
-    times = np.zeros(model.pair_state.shape[0], dtype=np.int64)
-    for t in range(theta.shape[0]):
-        if theta[t] == subgoal:
-            times[model.pair_of[t]] += 1
-    fit = np.zeros(window.shape[0])
-    for pair in np.flatnonzero(times):
-        unexplained = slip * model.uniform[model.pair_state[pair]]
-        for place in range(window.shape[0]):
-            explained = (1.0 - slip) * chosen[pair, window[place]]
-            fit[place] += times[pair] * math.log(explained + unexplained)
-    share = np.exp(_FLATTENED * (fit - fit.max()))
-    return (1.0 - _AT_RANDOM) * share / share.sum() + _AT_RANDOM / window.shape[0]
+    trials, candidates = weights.shape
+    lanes = (candidates + _SUMS - 1) // _SUMS * _SUMS  # those at the end remain zero
+    explained = 1.0 - parameters[SLIP]
+    likely, stays, drawn = np.zeros(lanes), np.zeros(lanes), np.zeros((trials, lanes))
+    drawn[:, :candidates] = weights
+    message, total, scores = np.empty((trials, lanes)), np.empty(trials), np.zeros(trials)
+    for episode in range(bounds.shape[0]):
+        first, end = bounds[episode]
+        message[:] = 0.0
+        total[:] = 1.0
+        for t in range(first, end):
+            state, pair = model.state_of[t], model.pair_of[t]
+            unexplained = parameters[SLIP] * model.uniform[state]
+            rho = parameters[ELSEWHERE]
+            here, there = model.near_first[state], model.near_first[state + 1]
+            if t == first:
+                rho, there = 1.0, here
+            for candidate in range(candidates):
+                likely[candidate] = explained * chosen[pair, candidate] + unexplained
+                stays[candidate] = 1.0 - rho
+            for candidate in model.near[here:there]:
+                at = model.arrived[model.state_of[t - 1], candidate]
+                stays[candidate] = 1.0 - (parameters[AT_SUBGOAL] if at else parameters[ON_ARRIVAL])
+            for trial in range(trials):
+                switch = rho * total[trial]
+                for index in range(here, there):
+                    candidate = model.near[index]
+                    switch += message[trial, candidate] * (1.0 - stays[candidate] - rho)
+                for lane in range(lanes):
+                    moved = message[trial, lane] * stays[lane] + switch * drawn[trial, lane]
+                    message[trial, lane] = moved * likely[lane]
+                a = b = c = d = 0.0
+                for lane in range(0, lanes, _SUMS):
+                    a += message[trial, lane]
+                    b += message[trial, lane + 1]
+                    c += message[trial, lane + 2]
+                    d += message[trial, lane + 3]
+                total[trial] = (a + c) + (b + d)
+                if total[trial] < _SMALL:
+                    scores[trial] += math.log(total[trial])
+                    for lane in range(lanes):
+                        message[trial, lane] /= total[trial]
+                    total[trial] = 1.0
+        scores += np.log(total)
+    return scores
 
 
 @njit(nogil=True, cache=True)
 def _episode_bounds(model, part):  # type: ignore[no-untyped-def]
-    """First observation and end of each episode in a part of the map."""
-    bounds = []
-    first = 0
-    for t in range(1, model.starts.shape[0] + 1):
-        if t == model.starts.shape[0] or model.starts[t]:
-            if model.state_part[model.state_of[first]] == part:
-                bounds.append((first, t))
-            first = t
-    return bounds
+    """(E, 2) first observation and end of each episode in a part of the map."""
+    firsts = np.flatnonzero(model.starts)
+    ends = np.append(firsts[1:], model.starts.shape[0])
+    here = model.state_part[model.state_of[firsts]] == part
+    return np.column_stack((firsts[here], ends[here]))
 
 
 @njit(nogil=True, cache=True)
