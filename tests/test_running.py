@@ -313,7 +313,9 @@ def grown(model: str, **settings: float) -> tuple[RunningPosterior, RunningPoste
 
 @pytest.mark.parametrize("model", MODELS)
 def test_new_observations_are_in_the_posterior_before_a_sweep(model: str) -> None:
-    before, after = grown(model)
+    # A sweep comes first where less than a quarter of the draws is left in effect: for an episode
+    # to a cell that was never visited, with two of the first twelve seeds (0.19 to 0.45 are left).
+    before, after = grown(model, seed=1)
     assert after.ready
     assert after.sweeps == 0
     posterior = after.posterior()
