@@ -250,7 +250,7 @@ class BackgroundInference(Worker):
         end = time.monotonic() + (_ROUND if running.sweeps else _FIRST_ROUND)
         while True:
             running.advance(_DRAWS)
-            if self._changed or running.finished or time.monotonic() > end:
+            if self._changed or running.finished or running.full or time.monotonic() > end:
                 break
         self._keep_if_due(running)
         return self._running_result()

@@ -66,7 +66,7 @@ class RunningPosterior:
         self.placement, self.grid_map, self.settings = placement, grid_map, settings
         self.sweeps = 0
         self._seconds = 0.0
-        self._converged, self._next_look = False, settings.sweeps
+        self._converged = False
         most = most_draws(settings.chains, len(placement.demonstration))
         self._capacity = max(2, min(CAPACITY * max(1, 4 // settings.chains), most // 2 * 2))
         same = before if before and before._is_about(grid_map, settings) else None
@@ -157,6 +157,14 @@ class RunningPosterior:
         """Whether there is a posterior; there always is after a sweep."""
         return self._told is not None or self._kept > 0
 
+    @property
+    def full(self) -> bool:
+        """Whether there is no room for draws left, at ever twice as many sweeps.
+
+        The posterior at that time is the one by which chains are found to have converged.
+        """
+        return self._kept == self._capacity
+
     def advance(self, draws: int) -> None:
         """Go on for so many further draws of each chain, or fewer where room is short."""
         states = self._states
@@ -165,7 +173,7 @@ class RunningPosterior:
             self._draws = self._sampler.room_for(self._model, shape)
             if self._particles is None:
                 self._particles = Particles.empty(self._model, self.settings.chains)
-        if self._kept == self._capacity:
+        if self.full:
             self._draws.drop_every_second()
             self._kept //= 2
             self._thin *= 2
@@ -212,9 +220,9 @@ class RunningPosterior:
             self.settings,
             sampling,
         )
-        # As rarely as offline: who looks often enough sees every chain converge.
-        if self.settings.max_sweeps and self.sweeps >= self._next_look:
-            self._next_look = 2 * self.sweeps
+        # As rarely as offline, for who looks often enough sees every chain converge, and when
+        # there are most draws to tell it from: with half of them it can hardly be told.
+        if self.settings.max_sweeps and self.sweeps >= self.settings.sweeps and self.full:
             self._converged = posterior.convergence.reached
         return replace(posterior, sampling=replace(sampling, stopped=self._stopped))
 
