@@ -222,6 +222,20 @@ class Watched:
         self.peer.until(is_so, lambda: f"{what}, {wanted}; says {self.health()}")
         return self.health()
 
+    def until_quiet(self) -> None:
+        """Wait until it has counted the same for longer than what was sent may take to come.
+
+        Fast DDS sends again, every three seconds, what did not get across.
+        """
+
+        def counted() -> list[str | None]:
+            return [self.health().get(key) for key in ("observations", "drops", "queue")]
+
+        before = None
+        while counted() != before:
+            before, since = counted(), self.clock
+            self.peer.until(lambda since=since: self.clock >= since + 4, "diagnostics")
+
     def until_fault(self, words: str, count: int) -> None:
         """Wait until a fault with these words was counted so often."""
         self.peer.until(

@@ -51,7 +51,7 @@ def test_a_node_bears_whatever_bytes_come_on_its_topics(
     node.peer.until(
         lambda: int(node.health().get("drops", "0")) > MESSAGES / 10, "what was left out"
     )
-    node.until_health("what came", queue="0")
+    node.until_quiet()
     assert node.process.running
     assert node.call("reset").success
     node.until_health("nothing", observations="0", queue="0")
