@@ -13,10 +13,9 @@ PACKAGE = Path(resources.__file__).parent
 
 
 def found_from(package_parent: Path) -> subprocess.CompletedProcess[str]:
-    package = package_parent / "bnirl_ros"
-    package.mkdir(parents=True)
-    for name in ("__init__.py", "resources.py"):
-        shutil.copy(PACKAGE / name, package / name)
+    shutil.copytree(
+        PACKAGE, package_parent / "bnirl_ros", ignore=shutil.ignore_patterns("__pycache__")
+    )
     code = "from bnirl_ros.resources import share_folder; print(share_folder())"
     return subprocess.run(
         [sys.executable, "-c", code], cwd=package_parent, capture_output=True, text=True
