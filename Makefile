@@ -71,7 +71,7 @@ reference: venv  ## Write docs/reference.md, the topics and parameters of the no
 	$(BIN)/python -m bnirl_ros.nodes.reference docs/reference.md
 
 # All of them run, also where one misses its bound.
-BENCHMARKS ?= main_job start_up running load replay large_bag goal_values sequential paper_sampler \
+BENCHMARKS ?= main_job start_up running load intent replay large_bag goal_values sequential paper_sampler \
 	convergence growth
 
 policies: venv  ## Write policies/, what each node may do where access is controlled

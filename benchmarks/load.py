@@ -35,6 +35,7 @@ from bnirl_ros.demonstrations.demonstration import Demonstration
 from bnirl_ros.demonstrations.messages import TOPIC_TYPES
 from bnirl_ros.experiments.machine import machine
 from bnirl_ros.experiments.scenarios import PAPER_LOOP, demonstrate
+from bnirl_ros.maps.grid_map import GridMap
 from bnirl_ros.views.belief import map_message
 from bnirl_ros.views.demonstration import action_message, pose_message
 
@@ -116,57 +117,76 @@ def take(path: Path, every: int = 1, **parameters: object) -> None:
     sys.exit(status)
 
 
+class Demonstrator:
+    """Whoever publishes a demonstration. The height of a message, which the node does not read,
+    tells when it was sent."""
+
+    def __init__(self, grid_map: GridMap) -> None:
+        """Publishes the map, as soon as somebody hears it."""
+        self._rclpy, qos = importlib.import_module("rclpy"), importlib.import_module("rclpy.qos")
+        self._conversion = importlib.import_module("bnirl_ros.nodes.conversion")
+        self._rclpy.init()
+        self._node = self._rclpy.create_node("demonstrator")
+        latched = qos.QoSProfile(depth=1, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)
+        self._publishers = {
+            name: self._node.create_publisher(
+                self._conversion.message_class(type_name),
+                name,
+                latched if name == "map" else qos.QoSProfile(depth=40_000),
+            )
+            for name, type_name in TOPIC_TYPES.items()
+        }
+        self._grid_map = grid_map
+        self._poses: dict[tuple[int, int], Any] = {}
+        self._actions = [
+            self._conversion.to_ros(action_message(index, 0, "map")) for index in range(9)
+        ]
+        while not all(each.get_subscription_count() for each in self._publishers.values()):
+            time.sleep(0.01)
+        self._publishers["map"].publish(self._conversion.to_ros(map_message(grid_map, 0)))
+
+    def act(self, cell: tuple[int, int], action: int, stamp: int) -> None:
+        """Publish a pose and an action, with this stamp [ns]."""
+        if cell not in self._poses:
+            pose = self._conversion.to_ros(pose_message(self._grid_map, cell, 0))
+            self._poses[cell] = pose
+        pose, chosen = self._poses[cell], self._actions[action]
+        for name, message, place in (
+            ("pose", pose, pose.pose.position),
+            ("action", chosen, chosen.vector),
+        ):
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+            place.z = time.monotonic()
+            self._publishers[name].publish(message)
+
+    def close(self) -> None:
+        """End, when all is acknowledged."""
+        for publisher in self._publishers.values():
+            publisher.wait_for_all_acked()
+        self._node.destroy_node()
+        self._rclpy.shutdown()
+
+
 def send(observations: int, rate: float = OBSERVATIONS_PER_SECOND) -> None:
     """Publish the map and a walk, in time; ends when all is acknowledged.
 
-    The height of a message, which the node does not read, tells when it was sent. A walk of more
-    than `LONGEST_WALK` observations begins again, with later stamps.
+    A walk of more than `LONGEST_WALK` observations begins again, with later stamps.
 
     Args:
         observations: how many, each with two messages.
         rate: of observations [1/s].
     """
-    rclpy, qos = importlib.import_module("rclpy"), importlib.import_module("rclpy.qos")
-    conversion = importlib.import_module("bnirl_ros.nodes.conversion")
-    rclpy.init()
-    node = rclpy.create_node("demonstrator")
-    latched = qos.QoSProfile(depth=1, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)
-    publishers = {
-        name: node.create_publisher(
-            conversion.message_class(type_name),
-            name,
-            latched if name == "map" else qos.QoSProfile(depth=40_000),
-        )
-        for name, type_name in TOPIC_TYPES.items()
-    }
-    grid_map, seen = PAPER_LOOP.grid_map, walk(min(observations, LONGEST_WALK))
+    seen = walk(min(observations, LONGEST_WALK))
     episodes = int(seen.episode[-1]) + 1
-    poses = {
-        (x, y): conversion.to_ros(pose_message(grid_map, (x, y), 0))
-        for x, y in np.unique(seen.cells, axis=0).tolist()
-    }
-    actions = [conversion.to_ros(action_message(index, 0, "map")) for index in range(9)]
-    while not all(each.get_subscription_count() for each in publishers.values()):
-        time.sleep(0.01)
-    publishers["map"].publish(conversion.to_ros(map_message(grid_map, 0)))
+    demonstrator = Demonstrator(PAPER_LOOP.grid_map)
     begin = time.monotonic()
     for number in range(observations):
         round_, row = divmod(number, len(seen))
         stamp = STEP * number + GAP * (int(seen.episode[row]) + episodes * round_)
         x, y = seen.cells[row].tolist()
-        pose, action = poses[x, y], actions[seen.action[row]]
         time.sleep(max(0.0, begin + number / rate - time.monotonic()))
-        for name, message, place in (
-            ("pose", pose, pose.pose.position),
-            ("action", action, action.vector),
-        ):
-            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
-            place.z = time.monotonic()
-            publishers[name].publish(message)
-    for publisher in publishers.values():
-        publisher.wait_for_all_acked()
-    node.destroy_node()
-    rclpy.shutdown()
+        demonstrator.act((x, y), int(seen.action[row]), stamp)
+    demonstrator.close()
 
 
 class Observer:
@@ -179,10 +199,14 @@ class Observer:
         self._node = self._rclpy.create_node("observer")
         self.results = 0
         self.health: dict[str, str] = {}
-        markers = importlib.import_module("visualization_msgs.msg").MarkerArray
         diagnostics = importlib.import_module("diagnostic_msgs.msg").DiagnosticArray
-        self._node.create_subscription(markers, "subgoals", self._on_subgoals, 10)
+        self._markers = importlib.import_module("visualization_msgs.msg").MarkerArray
+        self.listen("subgoals", self._on_subgoals)
         self._node.create_subscription(diagnostics, "/diagnostics", self._on_diagnostics, 10)
+
+    def listen(self, topic: str, callback: Callable[[Any], None]) -> None:
+        """Have a callback called with the markers of a topic."""
+        self._node.create_subscription(self._markers, topic, callback, 10)
 
     def close(self) -> None:
         """Look no longer."""
