@@ -1029,14 +1029,20 @@ def _draw_action_parameters(model, state, chosen, confidence_too, generator):  #
 def _costs_taken(model, subgoal_of):  # type: ignore[no-untyped-def]
     """The distinct rows of actions and subgoals (M,), as `Evidence` has them on alpha."""
     actions, candidates = model.cost.shape[1:]
-    keys = np.sort(model.pair_of * candidates + subgoal_of)
-    rows = np.int64(0)
-    times = np.zeros(keys.shape[0])
-    for index in range(keys.shape[0]):
-        if index == 0 or keys[index] != keys[index - 1]:
-            keys[rows] = keys[index]
+    count = subgoal_of.shape[0]
+    keys, times = np.empty(count, dtype=np.int64), np.zeros(count)
+    row_of = np.full(candidates, -1)  # of the pair at hand, from its first row on
+    rows = first = np.int64(0)
+    for index in range(count):
+        t = model.by_pair[index]
+        pair, candidate = model.pair_of[t], subgoal_of[t]
+        if index > 0 and pair != model.pair_of[model.by_pair[index - 1]]:
+            first = rows
+        if row_of[candidate] < first:
+            row_of[candidate] = rows
+            keys[rows] = pair * candidates + candidate
             rows += 1
-        times[rows - 1] += 1.0
+        times[row_of[candidate]] += 1.0
     costs, uniform = np.empty((actions + 1, rows)), np.empty(rows)
     for row in range(rows):
         pair, candidate = keys[row] // candidates, keys[row] % candidates
